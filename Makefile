@@ -1,0 +1,48 @@
+# Two commands: `make demo` flies, `make test` tests. Each sets up what it needs; nothing but Python 3.11 and make is assumed.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+# `python3.11` where it exists, else whatever python3 is (pyproject.toml refuses an older one)
+ifeq ($(shell command -v $(PYTHON) 2>/dev/null),)
+PYTHON := python3
+endif
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-slow check format clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' Makefile
+
+$(VENV)/sim.stamp: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) -e '.[sim]'
+	touch $@
+
+$(VENV)/dev.stamp: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) torch==2.13.0
+	$(PIP) -e '.[dev]'
+	touch $@
+
+demo: $(VENV)/sim.stamp  ## fly the simulated vehicle through three crossing obstacles
+	$(BIN)/companion demo
+
+test: $(VENV)/dev.stamp  ## run the tests (without those marked slow)
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-slow: $(VENV)/dev.stamp  ## run every test
+	$(BIN)/python -m pytest
+
+check: $(VENV)/dev.stamp  ## lint, format check, types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/dev.stamp  ## format the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:  ## remove the virtual environment and caches
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis

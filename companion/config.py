@@ -1,0 +1,298 @@
+"""Configuration: TOML decoded once into frozen typed values; defaults live here, files only override.
+
+An unknown key, a wrong type or a value out of range is a `ConfigError` whose one line names the file and the key.
+``preset = "paper"`` in ``[tracking]`` or ``[safety]`` starts that section from the paper's literal values.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from companion.errors import ConfigError
+from companion.profiles import PROFILES, Profile
+
+Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
+NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]
+Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+
+
+class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of the file."""
+
+
+class VehicleConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    name: Name = "uav1"  # the Zenoh prefix is uav/<name>
+    profile: Literal["crazyflie-sim", "px4", "ardupilot"] = "crazyflie-sim"
+    source: Literal["mavlink", "zenoh"] = "mavlink"
+    stale_s: Positive = 0.5  # a vehicle state older than this is no longer fresh
+
+
+class MavlinkConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    url: str = "udpin://0.0.0.0:14540"
+    system_id: Annotated[int, Meta(ge=1, le=255)] | None = None  # None: latch the one autopilot heard for 3 s
+    heartbeat_timeout_s: Positive = 5.0
+
+
+class ZenohConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    mode: Literal["peer", "client"] = "peer"
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    multicast_scouting: bool = False
+
+
+class TargetConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    position: Point | None = None  # local ENU [m]; None: hold where engaged
+    yaw: float | None = None
+
+
+class EngageConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    by: Literal["profile", "command", "mode_switch"] = "profile"
+    stream_s: NonNegative = 0.5  # setpoints streamed before the external mode is asked for
+    timeout_s: Positive = 3.0
+
+
+class ObstaclesConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    required: tuple[str, ...] = ()  # sources whose silence while ACTIVE leads to HOLD
+    silent_s: Positive = 1.0
+    max_age_s: Positive = 0.5
+    queue: Annotated[int, Meta(ge=1, le=4096)] = 64
+
+
+class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Process noises in physical units: 1-sigma of the white input of each model, per sqrt(Hz)."""
+
+    preset: Literal["default", "paper"] = "default"
+    dt_s: Positive = 0.05  # the grid for which per-step constants are stated
+    accel_psd_cv: Positive = 0.6  # white acceleration PSD of CV [m^2/s^3]
+    jerk_psd_ca: Positive = 4.0  # white jerk PSD of CA [m^2/s^5]
+    accel_psd_ct: Positive = 0.6  # white acceleration PSD of CT [m^2/s^3]
+    turn_psd_ct: Positive = 0.5  # white turn acceleration PSD of CT [rad^2/s^3]
+    q_paper: NonNegative = 0.0  # > 0: Q = q_paper I per dt_s for every model (Remark 1)
+    measurement_variance_m2: Positive = 0.05  # used where a detection states no position_std (Remark 1)
+    force_measurement_variance: bool = False  # True: ignore stated position_std
+    stay_probability: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.9  # pi_jj per dt_s, the rest shared evenly
+    turn_window: Annotated[int, Meta(ge=2, le=200)] = 20  # steps of dt_s
+    likelihood_window: Annotated[int, Meta(ge=1, le=20)] = 2  # updates
+    gate_sigma: Positive = 4.0
+    coast_s: Positive = 1.0  # a track without measurement is dropped after this
+    max_tracks: Annotated[int, Meta(ge=1, le=1024)] = 128
+
+
+class PolicyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    artifact: str = "builtin:default"  # a folder, or builtin:NAME
+    backend: Literal["onnx", "torch"] = "onnx"
+    capture_radius_m: NonNegative = 0.6  # inside it the documented hold law flies
+    hold_kp: NonNegative = 2.0  # [1/s^2]
+    hold_kd: NonNegative = 2.6  # [1/s]
+
+
+class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Table 1 of the paper and the readings of the design, 5.1 to 5.10."""
+
+    preset: Literal["default", "paper"] = "default"
+    filter: Literal["acbf", "none"] = "acbf"
+    form: Literal["sphere", "paper"] = "sphere"  # 1/2(|r|^2 - D^2), or (22) to the letter
+    horizon: Annotated[int, Meta(ge=0, le=100)] = 20
+    dt_s: Positive = 0.05
+    alpha1: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.8
+    alpha2: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
+    epsilon_max: Positive = 2.0
+    eta: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.5
+    lambda_u: Positive = 1.0
+    lambda_epsilon: Positive = 10.0
+    lambda_delta: Positive = 1e4
+    drone_radius_m: Positive = 0.2
+    cushion_m: NonNegative = 0.1
+    kappa: NonNegative = 2.0
+    sigma_delay_s: NonNegative = 0.01
+    solver: Literal["daqp", "osqp"] = "daqp"
+    iterations: Annotated[int, Meta(ge=1, le=50)] = 6
+    tolerance_m_s2: Positive = 1e-6
+
+
+class LimitsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    acceleration_m_s2: Positive = 3.0  # each axis, net of gravity
+    speed_m_s: Positive = 6.0
+    arena_min: Point = (-10.0, -10.0, 0.3)  # floor is the third component
+    arena_max: Point = (10.0, 10.0, 10.0)
+
+
+class DelayConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    loop_s: NonNegative = 0.0  # configured time from state to setpoint at the autopilot
+    actuation_s: NonNegative | None = None  # None: the profile's
+
+
+class DisturbanceConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    enabled: bool = True
+    bandwidth_hz: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
+    bound_m_s2: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
+
+
+class LogConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    directory: str | None = None  # None: no log
+
+
+class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    mode: Literal["normal", "monitor"] = "normal"
+    sync: Literal["none", "lockstep"] = "none"
+    lockstep_sources: tuple[str, ...] = ()  # sources whose markers each tick waits for
+    tick_hz: Annotated[int, Meta(ge=1, le=400)] | None = None  # None: the profile's
+    vehicle: VehicleConfig = VehicleConfig()
+    mavlink: MavlinkConfig = MavlinkConfig()
+    zenoh: ZenohConfig = ZenohConfig()
+    target: TargetConfig = TargetConfig()
+    engage: EngageConfig = EngageConfig()
+    obstacles: ObstaclesConfig = ObstaclesConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    policy: PolicyConfig = PolicyConfig()
+    safety: SafetyConfig = SafetyConfig()
+    limits: LimitsConfig = LimitsConfig()
+    delay: DelayConfig = DelayConfig()
+    disturbance: DisturbanceConfig = DisturbanceConfig()
+    log: LogConfig = LogConfig()
+
+    @property
+    def profile(self) -> Profile:
+        return PROFILES[self.vehicle.profile]
+
+    @property
+    def rate_hz(self) -> int:
+        return self.tick_hz if self.tick_hz is not None else self.profile.tick_hz
+
+    @property
+    def engage_by(self) -> str:
+        return self.profile.engage_by if self.engage.by == "profile" else self.engage.by
+
+    @property
+    def actuation_s(self) -> float:
+        return self.profile.actuation_lag_s if self.delay.actuation_s is None else self.delay.actuation_s
+
+    @property
+    def prefix(self) -> str:
+        return f"uav/{self.vehicle.name}"
+
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "safety": {
+        "paper": {"form": "paper", "horizon": 5, "kappa": 0.0, "sigma_delay_s": 0.0},
+    },
+    "tracking": {
+        # Remark 1; 0.6 on the diagonal, 0.2 elsewhere
+        "paper": {
+            "q_paper": 0.05,
+            "measurement_variance_m2": 0.05,
+            "force_measurement_variance": True,
+            "stay_probability": 0.6,
+        },
+    },
+}
+
+
+def parse_config(raw: Mapping[str, Any], *, source: str = "configuration") -> Config:
+    """Typed configuration from decoded TOML; ``source`` names the file in errors.
+
+    Raises:
+        ConfigError: one line ``source: key: expectation``.
+    """
+    merged: dict[str, Any] = dict(raw)
+    for section, presets in PRESETS.items():
+        table = merged.get(section)
+        if isinstance(table, Mapping):
+            base = presets.get(str(table.get("preset", "default")), {})
+            merged[section] = {**base, **table}
+    try:
+        config = msgspec.convert(merged, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {_pointed(str(error))}") from None
+    _check_numbers(msgspec.to_builtins(config), source, "")
+    _check_relations(config, source)
+    return config
+
+
+def load_config(path: Path, overrides: tuple[str, ...] = ()) -> Config:
+    """The configuration in a TOML file, with ``section.key=value`` overrides (values in TOML syntax) on top."""
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}), expected a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from None
+    return parse_config(apply_overrides(raw, overrides), source=str(path))
+
+
+def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str, Any]:
+    """``raw`` with each ``a.b=value`` set; a value that is not TOML is taken as a string."""
+    for item in overrides:
+        key, found, text = item.partition("=")
+        if not found or not key:
+            raise ConfigError(f"--set {item}: expected section.key=value")
+        try:
+            value = tomllib.loads(f"v = {text}")["v"]
+        except tomllib.TOMLDecodeError:
+            value = text
+        table = raw
+        *parents, leaf = key.split(".")
+        for parent in parents:
+            table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
+                raise ConfigError(f"--set {item}: {parent} is not a section")
+        table[leaf] = value
+    return raw
+
+
+def config_hash(config: Config) -> str:
+    """SHA-256 of the resolved configuration, log directory left out (it does not change the flight)."""
+    values = msgspec.to_builtins(config)
+    values.pop("log")
+    return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()
+
+
+def _pointed(message: str) -> str:
+    """``Expected `float`... - at `$.safety.alpha1` `` -> ``safety.alpha1: Expected `float`...``."""
+    text, at, path = message.rpartition(" - at `$")
+    if not at:
+        return message
+    return f"{path.rstrip('`').lstrip('.')}: {text}" if path.rstrip("`") else text
+
+
+def _check_numbers(value: Any, source: str, path: str) -> None:
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_numbers(item, source, f"{path}.{key}" if path else key)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            _check_numbers(item, source, path)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{source}: {path}: expected a finite number, got {value}")
+
+
+def _check_relations(config: Config, source: str) -> None:
+    limits = config.limits
+    for axis, low, high in zip("xyz", limits.arena_min, limits.arena_max, strict=True):
+        if low >= high:
+            raise ConfigError(
+                f"{source}: limits.arena_min: expected below arena_max on axis {axis}, got {low} >= {high}"
+            )
+    if 1000 % config.rate_hz:
+        raise ConfigError(
+            f"{source}: tick_hz: expected a control period of whole milliseconds, got {config.rate_hz} Hz"
+        )
+    target = config.target.position
+    if target is not None:
+        for axis, low, value, high in zip("xyz", limits.arena_min, target, limits.arena_max, strict=True):
+            if not low <= value <= high:
+                raise ConfigError(
+                    f"{source}: target.position: expected {axis} inside limits.arena [{low}, {high}], got {value}"
+                )
+    if config.sync == "none" and config.lockstep_sources:
+        raise ConfigError(f'{source}: lockstep_sources: expected only with sync = "lockstep"')
