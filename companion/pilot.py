@@ -1,0 +1,230 @@
+"""The whole brain in one synchronous call: track, predict, ask the policy, filter (design 1, 5.7, 5.14).
+
+No clock and no I/O: the same inputs give the same outputs, bit for bit, and the class is usable as a library.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from companion.config import Config
+from companion.disturbance import DisturbanceObserver
+from companion.errors import BrainFailure, PolicyOutputInvalid
+from companion.policy import Policy, brake, hold, load_policy
+from companion.safety.filter import FilterInput, SafetyFilter
+from companion.tracking.tracker import Tracker
+from companion.types import (
+    NS_PER_S,
+    DetectionFrame,
+    FilterResult,
+    Prediction,
+    TrackTable,
+    Vec3,
+    VehicleState,
+    Verdict,
+    frozen,
+)
+
+HOLD_SPEED_M_S = 0.3  # below it a braking vehicle anchors where it is
+_ZERO = frozen([0.0, 0.0, 0.0])
+
+
+class Task(StrEnum):
+    """What the pilot is asked to fly in a tick."""
+
+    STAY = "stay"  # hold where the vehicle is now, anchored anew each tick (READY)
+    FLY = "fly"  # to the target, or hold where engaged without one (ACTIVE)
+    HOLD = "hold"  # brake, then hold position (HOLD)
+
+
+@dataclass(frozen=True, slots=True)
+class PilotInput:
+    """One tick. ``frames`` may be empty; ``target_enu`` None means: hold where this flight began."""
+
+    vehicle: VehicleState
+    frames: tuple[DetectionFrame, ...] = ()
+    task: Task = Task.FLY
+    target_enu: Vec3 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PilotOutput:
+    """The answer to one tick; accelerations are net (gravity excluded), ENU [m/s^2]."""
+
+    stamp_ns: int
+    u_ref: Vec3
+    result: FilterResult
+    wire: Vec3  # u_safe less the disturbance estimate: what the autopilot is sent
+    disturbance: Vec3
+    tracks: TrackTable
+    prediction: Prediction
+    policy_valid: bool
+    obstacle_frames: int
+
+
+class Pilot:
+    """Tracker, policy and safety filter behind ``step``.
+
+    The setpoint that answers the state of instant t acts at t + delay (loop time plus the actuation lag of the
+    profile, as dead time). Vehicle and obstacles are both predicted to that instant, the vehicle under the
+    accelerations already commanded, and the barrier's grid starts there.
+
+    Raises:
+        ArtifactError: at construction, where the policy cannot be flown with this configuration.
+    """
+
+    def __init__(self, config: Config, policy: Policy | None = None) -> None:
+        self._config = config
+        self._policy = load_policy(config.policy, config.limits) if policy is None else policy
+        self._tracker = Tracker(config.tracking)
+        self._filter = SafetyFilter(config.safety, config.limits)
+        self._observer = DisturbanceObserver(config.disturbance, lag_s=config.actuation_s)
+        self._delay_ns = round((config.delay.loop_s + config.actuation_s) * NS_PER_S)
+        self._history_len = 2 + math.ceil(self._delay_ns * config.rate_hz / NS_PER_S)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything; the next step is bit-equal to the first of a new pilot."""
+        self._tracker.reset()
+        self._filter.reset()
+        self._observer.reset()
+        self._commands: deque[tuple[int, Vec3]] = deque(maxlen=self._history_len)  # (acts from [ns], net a)
+        self._last_ns: int | None = None
+        self._anchor: Vec3 | None = None
+        self._task: Task | None = None
+
+    def step(self, inputs: PilotInput, *, sent: bool = True) -> PilotOutput:
+        """The safe acceleration for one tick.
+
+        Args:
+            sent: whether this answer goes to a vehicle that obeys it; otherwise it is not counted as commanded.
+        Raises:
+            BrainFailure: the vehicle state is not finite, or its stamp does not advance.
+        """
+        vehicle = inputs.vehicle
+        elapsed_s = self._elapsed(vehicle)
+        self._tracker.update(inputs.frames, vehicle.stamp_ns)
+        start_ns = vehicle.stamp_ns + self._delay_ns
+        p_act, v_act = self._at_action(vehicle)
+        safety = self._config.safety
+        prediction = self._tracker.predict(start_ns, safety.horizon + 3, safety.dt_s)
+        u_ref, valid = self._reference(inputs, p_act, v_act)
+        flying = inputs.task is not Task.STAY
+        disturbance = self._observer.update(vehicle.v_enu, elapsed_s, adapt=flying and sent)
+        result = self._filtered(vehicle, p_act, v_act, u_ref, prediction, flying, elapsed_s)
+        wire = frozen(result.a_safe - disturbance)
+        if sent:
+            self._commands.append((start_ns, result.a_safe))
+        self._observer.command(wire if sent else _ZERO, saturated=self._saturated(result.a_safe))
+        tracks = self._tracker.table()
+        return PilotOutput(
+            stamp_ns=vehicle.stamp_ns,
+            u_ref=u_ref,
+            result=result,
+            wire=wire,
+            disturbance=disturbance,
+            tracks=tracks,
+            prediction=prediction,
+            policy_valid=valid,
+            obstacle_frames=len(inputs.frames),
+        )
+
+    def filter_acceleration(
+        self, vehicle: VehicleState, a_ref: Vec3, frames: tuple[DetectionFrame, ...] = ()
+    ) -> FilterResult:
+        """Filter a reference of your own (net, ENU [m/s^2]) instead of the policy's: the library's front door."""
+        elapsed_s = self._elapsed(vehicle)
+        self._tracker.update(frames, vehicle.stamp_ns)
+        start_ns = vehicle.stamp_ns + self._delay_ns
+        p_act, v_act = self._at_action(vehicle)
+        prediction = self._tracker.predict(start_ns, self._config.safety.horizon + 3, self._config.safety.dt_s)
+        result = self._filtered(vehicle, p_act, v_act, frozen(a_ref), prediction, True, elapsed_s)
+        self._commands.append((start_ns, result.a_safe))
+        return result
+
+    def _elapsed(self, vehicle: VehicleState) -> float | None:
+        if not (np.isfinite(vehicle.p_enu).all() and np.isfinite(vehicle.v_enu).all()):
+            raise BrainFailure("vehicle state: expected finite position and velocity")
+        last, self._last_ns = self._last_ns, vehicle.stamp_ns
+        if last is None:
+            return None
+        if vehicle.stamp_ns <= last:
+            raise BrainFailure(f"vehicle state: expected a stamp after {last} ns, got {vehicle.stamp_ns} ns")
+        return (vehicle.stamp_ns - last) / NS_PER_S
+
+    def _at_action(self, vehicle: VehicleState) -> tuple[Vec3, Vec3]:
+        """Position and velocity at the instant at which this tick's setpoint acts.
+
+        p += v t + a t^2 / 2, v += a t over each piece of [stamp, stamp + delay) under the command acting in it;
+        before the first command the vehicle is taken to coast.
+        """
+        p, v = vehicle.p_enu, vehicle.v_enu
+        now, end = vehicle.stamp_ns, vehicle.stamp_ns + self._delay_ns
+        commands = list(self._commands)
+        for index, (since, a) in enumerate(commands):
+            until = commands[index + 1][0] if index + 1 < len(commands) else end
+            t = (min(until, end) - max(since, now)) / NS_PER_S
+            if t > 0.0:
+                p = p + v * t + a * (0.5 * t * t)
+                v = v + a * t
+        commanded_from = max(now, commands[0][0]) if commands else end
+        coast_s = max(0, min(end, commanded_from) - now) / NS_PER_S
+        return p + vehicle.v_enu * coast_s, v
+
+    def _reference(self, inputs: PilotInput, p_act: Vec3, v_act: Vec3) -> tuple[Vec3, bool]:
+        """The reference acceleration, and whether the policy's output was usable."""
+        if inputs.task is not self._task:
+            self._task, self._anchor = inputs.task, None
+        config, limit = self._config.policy, self._config.limits.acceleration_m_s2
+        v = inputs.vehicle.v_enu
+        if inputs.task is Task.STAY:
+            return frozen(brake(v_act, config, limit)), True
+        if inputs.task is Task.FLY:
+            if self._anchor is None:
+                self._anchor = inputs.vehicle.p_enu
+            goal = self._anchor if inputs.target_enu is None else inputs.target_enu
+            try:
+                return frozen(self._policy.act(v, goal - inputs.vehicle.p_enu)), True
+            except PolicyOutputInvalid:
+                return frozen(brake(v_act, config, limit)), False
+        if self._anchor is None and float(np.linalg.norm(v)) < HOLD_SPEED_M_S:
+            self._anchor = inputs.vehicle.p_enu
+        if self._anchor is None:
+            return frozen(brake(v_act, config, limit)), True
+        return frozen(hold(self._anchor - p_act, v_act, config, limit)), True
+
+    def _filtered(
+        self,
+        vehicle: VehicleState,
+        p_act: Vec3,
+        v_act: Vec3,
+        u_ref: Vec3,
+        prediction: Prediction,
+        flying: bool,
+        elapsed_s: float | None,
+    ) -> FilterResult:
+        if self._config.safety.filter == "none":
+            limit = self._config.limits.acceleration_m_s2
+            return FilterResult(frozen(np.clip(u_ref, -limit, limit)), Verdict.NOMINAL, None, (), 0, "none")
+        bound = self._config.disturbance.bound_m_s2 if self._config.disturbance.enabled else 0.0
+        return self._filter.step(
+            FilterInput(
+                p_enu=p_act,
+                v_enu=v_act,
+                a_ref=u_ref,
+                prediction=prediction,
+                p_std_m=vehicle.p_std_m,
+                limits_on=flying,
+                accel_shrink_m_s2=bound if flying else 0.0,
+                elapsed_s=elapsed_s,
+            )
+        )
+
+    def _saturated(self, a_safe: Vec3) -> bool:
+        limit = self._config.limits.acceleration_m_s2
+        return bool(np.abs(a_safe).max() >= limit - self._config.disturbance.bound_m_s2 - 1e-9)
