@@ -135,7 +135,7 @@ class DelayConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True
 class DisturbanceConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     enabled: bool = True
     bandwidth_hz: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
-    bound_m_s2: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
+    bound_m_s2: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.3
 
 
 class LogConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -120,7 +120,7 @@ class Pilot:
         wire = frozen(result.a_safe - disturbance)
         if sent:
             self._commands.append((start_ns, result.a_safe))
-        self._observer.command(wire if sent else _ZERO, saturated=self._saturated(result.a_safe))
+        self._observer.command(wire if sent else _ZERO, saturated=self._saturated(wire))
         tracks = self._tracker.table()
         return PilotOutput(
             stamp_ns=vehicle.stamp_ns,
@@ -180,7 +180,7 @@ class Pilot:
         """The reference acceleration, and whether the policy's output was usable."""
         if inputs.task is not self._task:
             self._task, self._anchor = inputs.task, None
-        config, limit = self._config.policy, self._config.limits.acceleration_m_s2
+        config, limit = self._config.policy, self._reserve_limit()
         v = inputs.vehicle.v_enu
         if inputs.task is Task.STAY:
             return frozen(brake(v_act, config, limit)), True
@@ -189,7 +189,8 @@ class Pilot:
                 self._anchor = inputs.vehicle.p_enu
             goal = self._anchor if inputs.target_enu is None else inputs.target_enu
             try:
-                return frozen(self._policy.act(v, goal - inputs.vehicle.p_enu)), True
+                action = self._policy.act(v, goal - inputs.vehicle.p_enu)
+                return frozen(np.clip(action, -limit, limit)), True
             except PolicyOutputInvalid:
                 return frozen(brake(v_act, config, limit)), False
         if self._anchor is None and float(np.linalg.norm(v)) < HOLD_SPEED_M_S:
@@ -209,9 +210,8 @@ class Pilot:
         elapsed_s: float | None,
     ) -> FilterResult:
         if self._config.safety.filter == "none":
-            limit = self._config.limits.acceleration_m_s2
-            return FilterResult(frozen(np.clip(u_ref, -limit, limit)), Verdict.NOMINAL, None, (), 0, "none")
-        bound = self._config.disturbance.bound_m_s2 if self._config.disturbance.enabled else 0.0
+            return FilterResult(u_ref, Verdict.NOMINAL, None, (), 0, "none")
+        full = self._config.limits.acceleration_m_s2
         return self._filter.step(
             FilterInput(
                 p_enu=p_act,
@@ -220,11 +220,15 @@ class Pilot:
                 prediction=prediction,
                 p_std_m=vehicle.p_std_m,
                 limits_on=flying,
-                accel_shrink_m_s2=bound if flying else 0.0,
+                accel_shrink_m_s2=full - self._reserve_limit(),
                 elapsed_s=elapsed_s,
             )
         )
 
-    def _saturated(self, a_safe: Vec3) -> bool:
-        limit = self._config.limits.acceleration_m_s2
-        return bool(np.abs(a_safe).max() >= limit - self._config.disturbance.bound_m_s2 - 1e-9)
+    def _reserve_limit(self) -> float:
+        """The acceleration limit less what the disturbance estimate may add on the wire [m/s^2]."""
+        reserve = self._config.disturbance.bound_m_s2 if self._config.disturbance.enabled else 0.0
+        return self._config.limits.acceleration_m_s2 - reserve
+
+    def _saturated(self, wire: Vec3) -> bool:
+        return bool(np.abs(wire).max() >= self._config.limits.acceleration_m_s2 - 1e-9)
