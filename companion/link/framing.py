@@ -1,0 +1,91 @@
+"""Bytes to MAVLink messages: finds packets in a stream, checks them, recovers from anything.
+
+pymavlink's own stream parser drops as many bytes as a damaged header claims, good packets included, and may
+wait for 280 bytes that never come. Here a failed packet costs one byte and the search goes on behind it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+_V1, _V2 = 0xFE, 0xFD
+_SIGNED = 0x01
+_MAGICS = (_V1, _V2)
+
+
+class Framer:
+    """Splits one byte stream. ``counts``: messages, unknown, bad_packets, garbage_bytes."""
+
+    def __init__(self) -> None:
+        self._pending = b""
+        self._decoder = dialect.MAVLink(None)
+        self.counts: Counter[str] = Counter()
+
+    def push(self, data: bytes) -> list[Any]:
+        """pymavlink messages that ``data`` completes. Never raises, whatever the bytes."""
+        data = self._joined(bytes(data))
+        messages: list[Any] = []
+        at = 0
+        while at < len(data):
+            if data[at] not in _MAGICS:
+                start, at = at, _next_magic(data, at)
+                self.counts["garbage_bytes"] += at - start
+                continue
+            message, length, outcome = self._decode(data, at)
+            if length == 0:
+                self._pending = data[at:]
+                break
+            self.counts[outcome] += 1
+            if message is not None:
+                messages.append(message)
+            at += length
+        return messages
+
+    def _joined(self, data: bytes) -> bytes:
+        """What was pending, and ``data``.
+
+        A damaged header must not hold back what follows it: a chunk that begins with a whole good packet does not
+        continue the pending one.
+        """
+        pending, self._pending = self._pending, b""
+        if pending and data and data[0] in _MAGICS and self._decode(data, 0)[0] is not None:
+            self.counts["garbage_bytes"] += len(pending)
+            return data
+        return pending + data
+
+    def _decode(self, data: bytes, at: int) -> tuple[Any | None, int, str]:
+        """The message at ``at``, the bytes to step over (0: more are needed, 1: failed) and how to count it."""
+        length = _packet_length(data, at)
+        if length == 0 or at + length > len(data):
+            return None, 0, ""
+        packet = bytearray(data[at : at + length])
+        if packet[0] == _V2 and packet[2] & ~_SIGNED:
+            return None, 1, "bad_packets"  # an incompatible feature: the specification says drop
+        try:
+            message = self._decoder.decode(packet)
+        except dialect.MAVError:
+            return None, 1, "bad_packets"
+        if isinstance(message, dialect.MAVLink_unknown):
+            # Its checksum cannot be known: believed only if a packet, or nothing, follows it.
+            end = at + length
+            if end < len(data) and data[end] not in _MAGICS:
+                return None, 1, "bad_packets"
+            return None, length, "unknown"
+        return message, length, "messages"
+
+
+def _packet_length(data: bytes, at: int) -> int:
+    """Length of the packet whose header starts at ``at``, 0 while the header is incomplete."""
+    if at + 3 > len(data):
+        return 0
+    if data[at] == _V1:
+        return data[at + 1] + 8
+    return data[at + 1] + 12 + (13 if data[at + 2] & _SIGNED else 0)
+
+
+def _next_magic(data: bytes, at: int) -> int:
+    found = [i for i in (data.find(_V1, at), data.find(_V2, at)) if i >= 0]
+    return min(found, default=len(data))
