@@ -146,7 +146,7 @@ def position_target_local_ned(m: Any) -> list[Event]:
 def command(m: Any) -> Command:
     """COMMAND_LONG or COMMAND_INT, as sent."""
     to = (m.target_system, m.target_component)
-    if m.id == mav.MSG_COMMAND_LONG:
+    if m.get_msgId() == mav.MSG_COMMAND_LONG:
         params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
         return Command(m.command, params, False, 0, 0, 0, 0.0, *_sender(m), *to)
     params = (m.param1, m.param2, m.param3, m.param4, float(m.x), float(m.y), m.z)

@@ -73,13 +73,14 @@ class MavlinkCodec:
         """
         events: list[Event] = []
         for message in self._framer.push(data):
-            decode = DECODERS.get(message.id)
+            kind = message.get_msgId()  # not .id: STATUSTEXT has a field of that name
+            decode = DECODERS.get(kind)
             try:
                 if decode is not None:
                     events.extend(decode(message))
-                elif message.id == mav.MSG_STATUSTEXT:
+                elif kind == mav.MSG_STATUSTEXT:
                     events.extend(self._texts.push(message))
-                elif message.id in (mav.MSG_COMMAND_LONG, mav.MSG_COMMAND_INT) and self._is_for_us(message):
+                elif kind in (mav.MSG_COMMAND_LONG, mav.MSG_COMMAND_INT) and self._is_for_us(message):
                     events.append(command(message))
             except Rejected as reason:
                 self.counts[str(reason)] += 1
