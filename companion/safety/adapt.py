@@ -1,0 +1,55 @@
+"""The adaptive coefficient epsilon: its target (27)-(28), its CLF (25)-(26), and what the rows leave it.
+
+For a given acceleration a row rise + e psi >= 0 is affine in the decay e = alpha2 epsilon: it bounds e from below
+where psi > 0 (the obstacle may be approached, no faster than e) and from above where psi < 0 (the vehicle is inside
+the keep-out distance and must leave it, no slower than e). Rows of one obstacle share one e.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from companion.config import SafetyConfig
+from companion.types import FloatArray
+
+CLF_PERIOD_S = 0.05  # eta of (26) is applied once per this time
+_TINY = 1e-30  # stands for psi = 0: the row then asks for rise >= 0 alone
+
+
+def epsilon_star(p_rel: FloatArray, v_rel: FloatArray, config: SafetyConfig) -> FloatArray:
+    """epsilon_max |v_r| max(0, cos theta_r) / |p_r|, (27)-(28) as written, within its bounds.
+
+    With p_r = p_o - p and v_r = v_o - v a positive cosine means separating, so epsilon* is 0 for whatever
+    approaches. |v_r| cos theta_r is the separation speed p_r . v_r / |p_r|.
+
+    Args:
+        p_rel, v_rel: obstacle minus vehicle, (M, 3) [m], [m/s].
+    Returns:
+        (M,) in [0, 1 / alpha2].
+    """
+    distance = np.maximum(np.sqrt((p_rel * p_rel).sum(axis=-1)), 1e-6)
+    separation = np.maximum((p_rel * v_rel).sum(axis=-1) / distance, 0.0)
+    return np.asarray(np.minimum(config.epsilon_max * separation / distance, 1.0 / config.alpha2))
+
+
+def clf_budget(previous: FloatArray, star: FloatArray, elapsed_s: FloatArray, eta: float) -> FloatArray:
+    """(1 - eta)^(elapsed / 0.05 s) (epsilon - epsilon*)^2: what (26) leaves V(epsilon(k+1)) without delta, (M,).
+
+    Both V are about the current epsilon*; ``elapsed_s`` (M,) is 0 for an obstacle without history.
+    """
+    return np.asarray((1.0 - eta) ** (elapsed_s / CLF_PERIOD_S) * (previous - star) ** 2)
+
+
+def decay_interval(rise: FloatArray, psi: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least and greatest decay in [0, 1] with rise + e psi >= 0 for all rows of an obstacle.
+
+    Args:
+        rise, psi: (..., R) [m^2].
+    Returns:
+        (lower, upper), each (...,); lower > upper where no decay serves.
+    """
+    bound = -rise / np.where(np.abs(psi) < _TINY, _TINY, psi)
+    opening = psi > -_TINY
+    lower = np.where(opening, bound, 0.0).max(axis=-1, initial=0.0)
+    upper = np.where(opening, 1.0, bound).min(axis=-1, initial=1.0)
+    return lower, upper
