@@ -18,6 +18,8 @@ from typing import TypeAlias
 from sim_bridge.crazyflie import SPIN_TORQUE_SIGN, Crazyflie, Quad, Triple
 from sim_bridge.physics import BodyState
 
+_LEAST_UPRIGHT = 0.5  # cosine of the tilt beyond which the vertical force is no longer kept
+
 
 @dataclass(frozen=True, slots=True)
 class AccelerationSetpoint:
@@ -55,11 +57,11 @@ class Gains:
     position_hz: float = 1.6  # [1/s] position error -> velocity
     velocity_hz: float = 4.0  # [1/s] velocity error -> acceleration
     a_max_m_s2: float = 4.0  # of the position and velocity loops
-    tilt_hz: float = 14.0  # [1/s] tilt error -> roll and pitch rate
+    tilt_hz: float = 13.0  # [1/s] tilt error -> roll and pitch rate
     yaw_hz: float = 4.0  # [1/s] heading error -> yaw rate
-    rate_hz: float = 60.0  # [1/s] roll and pitch rate error -> angular acceleration
+    rate_hz: float = 45.0  # [1/s] roll and pitch rate error -> angular acceleration
     yaw_rate_hz: float = 10.0
-    rate_damping: float = 0.6  # share of the measured angular acceleration fed back: shortens the motors' lag
+    rate_damping: float = 0.4  # share of the measured angular acceleration fed back: shortens the motors' lag
     tilt_max_rad: float = math.radians(35.0)
     rate_max_rad_s: float = 10.0
     least_collective: float = 0.35  # of the weight, so that tilt stays in command while sinking
@@ -88,9 +90,10 @@ class Controller:
             self.reset()
             return (0.0, 0.0, 0.0, 0.0)
         fx, fy, fz = self._thrust_vector(self._acceleration(state, setpoint))
-        w, x, y, z = state.q_wxyz
-        # body z axis in ENU: the collective is what the body can give of the wanted thrust now
-        collective_n = fx * 2.0 * (x * z + w * y) + fy * 2.0 * (y * z - w * x) + fz * (1.0 - 2.0 * (x * x + y * y))
+        _, x, y, _ = state.q_wxyz
+        upright = 1.0 - 2.0 * (x * x + y * y)  # cosine of the tilt
+        # the vertical force is kept exact while the body turns: sideways steps do not lift or drop the vehicle
+        collective_n = fz / max(upright, _LEAST_UPRIGHT) if upright > 0.0 else 0.0
         torque = self._torque(state, self._wanted_rates(state.q_wxyz, (fx, fy, fz), setpoint.yaw_rad))
         return self.mix(collective_n, torque)
 
@@ -148,7 +151,7 @@ class Controller:
         """I (k (omega* - omega) - d omega') + omega x I omega [N m], body axes."""
         gains = self.gains
         p, q, r = state.omega_flu
-        p0, q0, r0 = self._last_omega if self._last_omega is not None else state.omega_flu
+        p0, q0, _ = self._last_omega if self._last_omega is not None else state.omega_flu
         self._last_omega = state.omega_flu
         damping = gains.rate_damping * self._rate_hz
         jx, jy, jz = self.vehicle.inertia_kg_m2
