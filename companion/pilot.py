@@ -118,8 +118,7 @@ class Pilot:
         disturbance = self._observer.update(vehicle.v_enu, elapsed_s, adapt=flying and sent)
         result = self._filtered(vehicle, p_act, v_act, u_ref, prediction, flying, elapsed_s)
         wire = frozen(result.a_safe - disturbance)
-        if sent:
-            self._commands.append((start_ns, result.a_safe))
+        self._commands.append((start_ns, result.a_safe if sent else _ZERO))
         self._observer.command(wire if sent else _ZERO, saturated=self._saturated(wire))
         tracks = self._tracker.table()
         return PilotOutput(

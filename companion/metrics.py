@@ -1,0 +1,36 @@
+"""Counts and latencies of a running daemon."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+import numpy as np
+
+WINDOW = 100_000  # ticks that the quantiles look back on: bounds the memory of a long flight
+
+
+class TickMeter:
+    """Latency of whole ticks (state received to setpoint sent), verdict counts, deadline misses."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_ms = 1e3 * period_s
+        self.ticks = 0
+        self._latencies_ms: deque[float] = deque(maxlen=WINDOW)
+        self.verdicts: Counter[str] = Counter()
+        self.deadline_misses = 0  # answered after the next state was due
+        self.states_skipped = 0  # overtaken in the mailbox by a newer one
+
+    def tick(self, latency_ms: float, verdict: str) -> None:
+        self.ticks += 1
+        self._latencies_ms.append(latency_ms)
+        self.verdicts[verdict] += 1
+        if latency_ms > self._period_ms:
+            self.deadline_misses += 1
+
+    def quantiles_ms(self, last: int | None = None) -> dict[str, float]:
+        """p50, p99, p99.9 and max over the ``last`` ticks (at most WINDOW); empty before the first tick."""
+        values = list(self._latencies_ms)[-(last or WINDOW) :]
+        if not values:
+            return {}
+        p50, p99, p999 = np.quantile(values, [0.5, 0.99, 0.999])
+        return {"p50": round(p50, 4), "p99": round(p99, 4), "p99.9": round(p999, 4), "max": round(max(values), 4)}
