@@ -1,0 +1,277 @@
+"""The IMM filter bank, batched over M tracks and three models (14)-(19).
+
+One cycle for a measurement z = [I 0] x + q, q ~ N(0, R), dt after the last one:
+
+    c_j = sum_i pi_ij(dt) mu_i,      mu_ij = pi_ij mu_i / c_j                          interaction
+    x0_j = sum_i mu_ij T_i(x_i),     P0_j = sum_i mu_ij (P_i + (T_i x_i - x0_j)(.)^T)  (18)
+    x_j, P_j, Lambda_j               from the Kalman filter of model j                 filtering
+    mu_j ~ c_j mean(Lambda_j)        over the last updates                             (19), Remark 1
+
+Likelihoods stay logarithms until they are relative to the best model. Covariances are symmetrised at every update.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.config import TrackingConfig
+from companion.tracking.models import (
+    CT,
+    HAS,
+    HAS_BLOCK,
+    MODELS,
+    SIZE,
+    TURN,
+    TURN_LIMIT_RAD_S,
+    MotionModels,
+    P,
+    build_models,
+    propagate,
+    to_common,
+)
+from companion.types import FloatArray
+
+_LOG_2PI = math.log(2.0 * math.pi)
+_EYE = np.eye(MODELS)
+# Cofactors of a symmetric 3x3 in row-major order: entry k is S[f1] S[f2] - S[f3] S[f4].
+_COFACTOR = np.array(
+    [
+        [4, 5, 3, 2, 0, 1, 1, 2, 0],
+        [8, 6, 7, 7, 8, 6, 5, 3, 4],
+        [5, 3, 4, 1, 2, 0, 2, 0, 1],
+        [7, 8, 6, 8, 6, 7, 4, 5, 3],
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Constants:
+    """What the bank needs besides a measurement."""
+
+    models: MotionModels
+    dt_s: float  # grid of the per-step constants
+    persistence: float  # eigenvalue of the Markov matrix per dt_s: (3 pi_jj - 1) / 2
+    likelihood_window: int  # updates
+    turn_window: int  # updates; 0: the turn rate is estimated as a state
+    birth_variance: FloatArray  # (10,) of a new track; also the most that a foreign track may leave open
+
+
+def build_constants(config: TrackingConfig) -> Constants:
+    """Constants from the configuration, those per step turned into those per second."""
+    deviations = np.repeat(
+        [100.0, config.birth_speed_m_s, config.birth_accel_m_s2, config.turn_std_rad_s], (3, 3, 3, 1)
+    )
+    return Constants(
+        models=build_models(config),
+        dt_s=config.dt_s,
+        persistence=(3.0 * config.stay_probability - 1.0) / 2.0,
+        likelihood_window=config.likelihood_window,
+        turn_window=config.turn_window if config.turn_rate == "window" else 0,
+        birth_variance=deviations**2,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Bank:
+    """M tracks, each at its own instant; rows are tracks. No function here writes into a bank that it was given."""
+
+    x: FloatArray  # (M, 3, 10)
+    covariance: FloatArray  # (M, 3, 10, 10)
+    probabilities: FloatArray  # (M, 3)
+    history: FloatArray  # (M, W - 1, 3) log-likelihoods of the last updates, -inf where none
+    headings: FloatArray  # (M, L, 2) angle turned [rad] and time taken [s] in the last updates; L = turn_window
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def take(self, rows: npt.NDArray[np.intp]) -> Bank:
+        """The tracks ``rows``."""
+        return Bank(*(part[rows] for part in self.parts()))
+
+    def parts(self) -> tuple[FloatArray, ...]:
+        return self.x, self.covariance, self.probabilities, self.history, self.headings
+
+
+def join(first: Bank, second: Bank) -> Bank:
+    """The tracks of both."""
+    return Bank(*(np.concatenate(pair) for pair in zip(first.parts(), second.parts(), strict=True)))
+
+
+def put(bank: Bank, rows: npt.NDArray[np.intp], values: Bank) -> Bank:
+    """``bank`` with ``rows`` replaced."""
+    copies = [part.copy() for part in bank.parts()]
+    for copy, value in zip(copies, values.parts(), strict=True):
+        copy[rows] = value
+    return Bank(*copies)
+
+
+def birth(z: FloatArray, noise: FloatArray, constants: Constants) -> Bank:
+    """New tracks from one measurement each: what it does not tell is zero with the configured deviation.
+
+    Args:
+        z: (M, d), d = 3 (position) or 6 (position and velocity). noise: R (M, d, d).
+    """
+    count, d = z.shape
+    x = np.zeros((count, MODELS, SIZE))
+    x[..., :d] = z[:, None]
+    covariance = np.zeros((count, MODELS, SIZE, SIZE))
+    covariance[:] = np.diag(constants.birth_variance)
+    covariance[..., :d, :d] = noise[:, None]
+    return Bank(
+        x,
+        covariance * HAS_BLOCK,
+        np.full((count, MODELS), 1.0 / MODELS),
+        np.full((count, constants.likelihood_window - 1, MODELS), -np.inf),
+        np.zeros((count, constants.turn_window, 2)),
+    )
+
+
+def markov(dt: FloatArray, constants: Constants) -> FloatArray:
+    """Pi(dt) = exp(G dt), G the generator of the symmetric per-step matrix: 1/3 + (I - 1/3) persistence^(dt / dt_s)."""
+    decay = constants.persistence ** (np.maximum(dt, 0.0) / constants.dt_s)
+    return np.asarray((1.0 - decay[:, None, None]) / MODELS + decay[:, None, None] * _EYE)
+
+
+def mix(bank: Bank, dt: FloatArray, constants: Constants) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Interaction (18): mixed (x0, P0) of each model and its prior probability c (M, 3)."""
+    joint = bank.probabilities[:, :, None] * markov(dt, constants)  # (M, from, to)
+    prior = joint.sum(axis=1)
+    weights = (joint / prior[:, None, :]).swapaxes(1, 2)  # (M, to, from)
+    x, covariance = to_common(bank.x, bank.covariance)
+    if constants.turn_window == 0:
+        # CV and CA know nothing of the turn rate: CT's own estimate stands for theirs, no surer than a new track's
+        x[:, :CT, TURN] = bank.x[:, CT, TURN, None]
+        known = np.minimum(bank.covariance[:, CT, TURN, TURN], constants.birth_variance[TURN])
+        covariance[:, :CT, TURN, TURN] = known[:, None]
+    # second moments about CV's mean, so that metres from the origin do not cost digits
+    offset = x - x[:, :1]
+    second = (covariance + offset[..., :, None] * offset[..., None, :]).reshape(len(bank), MODELS, SIZE * SIZE)
+    shift = weights @ offset
+    mixed = (x[:, :1] + shift) * HAS
+    spread = (weights @ second).reshape(len(bank), MODELS, SIZE, SIZE) - shift[..., :, None] * shift[..., None, :]
+    spread *= HAS_BLOCK
+    if constants.turn_window:
+        total = bank.headings.sum(axis=1)
+        mixed[:, CT, TURN] = total[:, 0] / np.maximum(total[:, 1], constants.dt_s)
+        spread[:, CT, TURN, :] = spread[:, CT, :, TURN] = 0.0
+    return mixed, spread, prior
+
+
+def correct(
+    x: FloatArray, covariance: FloatArray, z: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Kalman update of every model by z = x[:d] + q, d = 3 (position) or 6 (position and velocity).
+
+    Args:
+        x: (M, 3, 10). covariance: (M, 3, 10, 10). z: (M, d). noise: R (M, d, d), positive definite.
+    Returns:
+        x, covariance, log-likelihood (M, 3), normalised innovation squared (M, 3).
+    """
+    d = z.shape[1]
+    innovation = z[:, None, :] - x[..., :d]
+    to_measurement = covariance[..., :d]
+    inverse, log_determinant = _invert(covariance[..., :d, :d] + noise[:, None])
+    weighted = inverse @ innovation[..., None]
+    nis = (innovation * weighted[..., 0]).sum(axis=-1)
+    gain = to_measurement @ inverse
+    updated = x + (to_measurement @ weighted)[..., 0]
+    spread = covariance - gain @ covariance[..., :d, :]
+    spread = 0.5 * (spread + spread.swapaxes(2, 3))
+    return updated, spread, -0.5 * (nis + log_determinant + d * _LOG_2PI), nis
+
+
+def _invert(s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverse and log-determinant of symmetric positive definite (..., d, d); d = 3 by cofactors."""
+    if s.shape[-1] != 3:
+        return np.linalg.inv(s), np.asarray(np.linalg.slogdet(s)[1])
+    flat = np.ascontiguousarray(s).reshape(*s.shape[:-2], 9)
+    f1, f2, f3, f4 = _COFACTOR
+    cofactor = flat.take(f1, axis=-1) * flat.take(f2, axis=-1) - flat.take(f3, axis=-1) * flat.take(f4, axis=-1)
+    determinant = (flat[..., :3] * cofactor[..., :3]).sum(axis=-1)
+    return np.asarray((cofactor / determinant[..., None]).reshape(s.shape)), np.log(determinant)
+
+
+def step(
+    bank: Bank, dt: FloatArray, z: FloatArray, noise: FloatArray, constants: Constants, *, foreign: bool = False
+) -> tuple[Bank, FloatArray]:
+    """One IMM cycle: the bank after a measurement of every track, each ``dt`` after its last one.
+
+    Args:
+        dt: (M,) > 0 [s]. z: (M, d), d = 3 or 6. noise: R (M, d, d), positive definite.
+        foreign: z was filtered elsewhere, its errors are correlated with ours: covariance intersection.
+    Returns:
+        the new bank and the normalised innovation squared of every model, (M, 3).
+    """
+    x, covariance, prior = mix(bank, dt, constants)
+    x, covariance = propagate(x, covariance, dt, constants.models)
+    if foreign:
+        covariance, noise = _shared(covariance, prior, noise)
+    x, covariance, log_likelihood, nis = correct(x, covariance, z, noise)
+    if foreign:
+        covariance = _bounded(covariance, constants.birth_variance)
+    turn = x[:, CT, TURN]
+    turn[:] = np.minimum(np.maximum(turn, -TURN_LIMIT_RAD_S), TURN_LIMIT_RAD_S)
+    score, history = log_likelihood, bank.history
+    if history.shape[1]:
+        recent = np.concatenate((history, log_likelihood[:, None]), axis=1)
+        # a likelihood of six numbers has other units than one of three: it is not averaged with them
+        score = np.logaddexp.reduce(recent, axis=1) if z.shape[1] == 3 else log_likelihood
+        history = recent[:, 1:] if z.shape[1] == 3 else np.full_like(history, -np.inf)
+    score = np.log(prior) + score
+    probabilities = np.exp(score - score.max(axis=1, keepdims=True))
+    probabilities /= probabilities.sum(axis=1, keepdims=True)
+    headings = bank.headings
+    if constants.turn_window:
+        headings = _turned(bank, fuse_mean(x, probabilities), dt)
+    return Bank(x, covariance, probabilities, history, headings), nis
+
+
+def _shared(covariance: FloatArray, prior: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Covariance intersection as a Kalman update with P / w and R / (1 - w).
+
+    w = tr R / (tr P + tr R) over the position blocks. Source: Niehsen, "Information fusion based on fast covariance
+    intersection filtering", 2002.
+    """
+    own = (prior * np.trace(covariance[..., P, P], axis1=2, axis2=3)).sum(axis=1)
+    other = np.trace(noise[:, :3, :3], axis1=1, axis2=2)
+    weight = np.clip(other / (own + other), 0.05, 0.95)
+    return covariance / weight[:, None, None, None], noise / (1.0 - weight)[:, None, None]
+
+
+def _bounded(covariance: FloatArray, most: FloatArray) -> FloatArray:
+    """Rows and columns scaled down where a variance exceeds ``most``: a congruence, so the matrix stays positive."""
+    variance = np.diagonal(covariance, axis1=2, axis2=3)
+    scale = np.sqrt(np.minimum(1.0, most / np.maximum(variance, np.finfo(np.float64).tiny)))
+    return np.asarray(covariance * scale[..., :, None] * scale[..., None, :])
+
+
+def _turned(bank: Bank, mean: FloatArray, dt: FloatArray) -> FloatArray:
+    """The window of heading changes with that from the fused velocity before to the one after appended."""
+    before = fuse_mean(bank.x, bank.probabilities)
+    cross = before[:, 3] * mean[:, 4] - before[:, 4] * mean[:, 3]
+    angle = np.arctan2(cross, before[:, 3] * mean[:, 3] + before[:, 4] * mean[:, 4])
+    latest = np.stack((angle, dt), axis=1)[:, None]
+    return np.concatenate((bank.headings[:, 1:], latest), axis=1)
+
+
+def fuse_mean(x: FloatArray, probabilities: FloatArray) -> FloatArray:
+    """Fused [p, v, a, Omega] (19), (M, 10), centripetal acceleration for CT."""
+    common = x.copy()
+    turn = x[:, CT, TURN]
+    common[:, CT, 6] = -turn * x[:, CT, 4]
+    common[:, CT, 7] = turn * x[:, CT, 3]
+    return np.asarray((probabilities[:, None, :] @ common)[:, 0])
+
+
+def fuse(x: FloatArray, covariance: FloatArray, probabilities: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fused mean (M, 10) and covariance (M, 10, 10) over [p, v, a, Omega], spread of means included (19)."""
+    common, spread = to_common(x, covariance)
+    mean = (probabilities[:, None, :] @ common)[:, 0]
+    offset = common - mean[:, None]
+    spread += offset[..., :, None] * offset[..., None, :]
+    flat = spread.reshape(len(x), MODELS, SIZE * SIZE)
+    return mean, (probabilities[:, None, :] @ flat).reshape(len(x), SIZE, SIZE)

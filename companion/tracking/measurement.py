@@ -1,0 +1,76 @@
+"""Detections of one frame as arrays that the bank can use: z, R, and which of them carry a velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.config import TrackingConfig
+from companion.types import Detection, FloatArray
+
+# A sensor that claims a perfect fix would take the last digit out of the filter; one that claims 100 m says nothing.
+VARIANCE_MIN = 1e-6  # [m^2], [m^2/s^2]
+VARIANCE_MAX = 1e4
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """D measurements. Where ``full`` is False only the position blocks of ``z`` and ``noise`` count."""
+
+    z: FloatArray  # (D, 6) position [m] and velocity [m/s]
+    noise: FloatArray  # (D, 6, 6)
+    full: np.ndarray  # (D,) bool
+    radius_m: FloatArray  # (D,)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def take(self, rows: np.ndarray) -> Measurements:
+        return Measurements(self.z[rows], self.noise[rows], self.full[rows], self.radius_m[rows])
+
+    def parts(self, full: bool) -> tuple[FloatArray, FloatArray]:
+        """(z, R) of dimension 6 or 3."""
+        return (self.z, self.noise) if full else (self.z[:, :3], self.noise[:, :3, :3])
+
+
+def is_finite(detection: Detection) -> bool:
+    """Whether every number of ``detection`` is finite; the wire checks this too, a library user may not."""
+    parts = [detection.radius_m, detection.p_std_m or 0.0, detection.v_std_m_s or 0.0]
+    arrays = (detection.p_enu, detection.v_enu, detection.covariance)
+    return bool(np.isfinite(parts).all()) and all(bool(np.isfinite(a).all()) for a in arrays if a is not None)
+
+
+def measure(detections: Sequence[Detection], config: TrackingConfig) -> Measurements:
+    """Arrays from detections. R: the stated covariance, else the stated standard deviations, else the configured ones.
+
+    Variances (eigenvalues, for a covariance) are held within 1e-6 and 1e4, so R is always positive definite. With
+    ``force_measurement_variance`` only the position counts, at the configured variance (Remark 1).
+    """
+    count = len(detections)
+    z, noise = np.zeros((count, 6)), np.zeros((count, 6, 6))
+    full = np.zeros(count, dtype=np.bool_)
+    diagonal = np.empty((count, 6))
+    for row, detection in enumerate(detections):
+        z[row, :3] = detection.p_enu
+        if detection.p_std_m is None or config.force_measurement_variance:
+            diagonal[row, :3] = config.measurement_variance_m2
+        else:
+            diagonal[row, :3] = detection.p_std_m**2
+        diagonal[row, 3:] = (config.velocity_std_m_s if detection.v_std_m_s is None else detection.v_std_m_s) ** 2
+        if detection.v_enu is not None and not config.force_measurement_variance:
+            z[row, 3:] = detection.v_enu
+            full[row] = True
+    noise.reshape(count, 36)[:, ::7] = np.minimum(np.maximum(diagonal, VARIANCE_MIN), VARIANCE_MAX)
+    for row, detection in enumerate(detections):
+        if detection.covariance is not None and not config.force_measurement_variance:
+            noise[row] = _bounded(np.asarray(detection.covariance, dtype=np.float64))
+    return Measurements(z, noise, full, np.array([d.radius_m for d in detections]))
+
+
+def _bounded(covariance: FloatArray) -> FloatArray:
+    """The nearest symmetric matrix whose eigenvalues lie within the bounds."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    bounded: FloatArray = (vectors * np.clip(values, VARIANCE_MIN, VARIANCE_MAX)) @ vectors.T
+    return bounded

@@ -1,0 +1,207 @@
+"""CV, CA and CT motion, batched over tracks: transition, process noise, and the way to a common state.
+
+    x(t + dt) = F_j(dt) x(t) + w,   w ~ N(0, Q_j(dt)),   j in (CV, CA, CT)           (14)-(17)
+
+All three models share one layout, [p, v, a, Omega] (10), so that a bank of M tracks is one array (M, 3, 10) and a
+prediction is one matrix product. A component that a model does not have stays exactly zero in its mean and
+covariance: CV uses 6 of the 10, CA 9, CT 7. Units: m, s, rad; frame: local ENU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.config import TrackingConfig
+from companion.types import FloatArray
+
+ComplexArray = npt.NDArray[np.complex128]
+
+CV, CA, CT = 0, 1, 2
+MODELS = 3
+P = slice(0, 3)  # position [m]
+V = slice(3, 6)  # velocity [m/s]
+A = slice(6, 9)  # acceleration [m/s^2], CA only
+TURN = 9  # horizontal turn rate [rad/s], CT only
+SIZE = 10
+
+HAS = np.zeros((MODELS, SIZE))  # 1 where the model has the component
+HAS[:, :6] = 1.0
+HAS[CA, A] = 1.0
+HAS[CT, TURN] = 1.0
+HAS.flags.writeable = False
+HAS_BLOCK = HAS[:, :, None] * HAS[:, None, :]  # (3, 10, 10)
+HAS_BLOCK.flags.writeable = False
+
+TURN_LIMIT_RAD_S = 10.0  # no obstacle of interest turns faster; keeps an absurd fix from winding CT up
+_SERIES_BELOW_RAD = 1e-3
+_ORDER = 5  # highest power of dt in F and Q
+_EXPONENTS = np.arange(_ORDER + 1.0)
+# (re, im) of two complex factors -> their 2x2 matrices [[re, -im], [im, re]], row-major
+_AS_MATRIX = np.kron(np.eye(2), np.array([[1.0, 0.0, 0.0, 1.0], [0.0, -1.0, 1.0, 0.0]]))
+_FLAT = MODELS * SIZE * SIZE
+# A Wiener turn rate is one integration away from the heading, two from the position; see `turn_noise`.
+_RANK = np.array([0, 0, 0, 1, 1, 1, 3, 3, 3, 2])
+_WEIGHT = np.array([[1 / 5, 1 / 4, 1 / 3, 0.0], [1 / 4, 1 / 3, 1 / 2, 0.0], [1 / 3, 1 / 2, 1.0, 0.0], [0.0] * 4])
+TURN_WEIGHT = _WEIGHT[_RANK[:, None], _RANK[None, :]]  # (10, 10)
+TURN_WEIGHT.flags.writeable = False
+
+
+@dataclass(frozen=True, slots=True)
+class MotionModels:
+    """Constants of the three models: F and Q as polynomials in dt, so that any dt of any track is one product."""
+
+    polynomials: FloatArray  # (6, 600): coefficients of dt^n of F (CT's rotation left out) and Q (its turn noise too)
+    turn_psd: float  # [rad^2/s^3]
+    prediction_noise: FloatArray  # (3, 6): coefficient of dt^n of each model's predicted position variance
+
+
+def build_models(config: TrackingConfig) -> MotionModels:
+    """Coefficients from physical noise densities, or Q = q I per dt_s where ``q_paper`` > 0 (Remark 1)."""
+    transition = np.zeros((_ORDER + 1, MODELS, SIZE, SIZE))
+    noise = np.zeros_like(transition)
+    prediction = np.zeros((MODELS, _ORDER + 1))
+    for model in (CV, CA, CT):
+        transition[0, model] = np.diag(HAS[model])
+        for axis in range(3):
+            p, v, a = axis, axis + 3, axis + 6
+            if model != CT or axis == 2:
+                transition[1, model, p, v] = 1.0
+            if model == CA:
+                transition[1, model, v, a] = 1.0
+                transition[2, model, p, a] = 0.5
+            else:
+                density = config.accel_psd_cv if model == CV else config.accel_psd_ct
+                _integrated_white(noise[:, model], (p, v), density)
+        if model == CA:
+            for axis in range(3):
+                _integrated_white(noise[:, CA], (axis, axis + 3, axis + 6), config.jerk_psd_ca)
+        prediction[model] = noise[:, model, 0, 0]
+    turn_psd = config.turn_psd_ct
+    if config.q_paper > 0.0:
+        rate = config.q_paper / config.dt_s
+        noise[:] = 0.0
+        noise[1] = rate * np.eye(SIZE) * HAS[:, :, None]
+        prediction[:] = 0.0
+        prediction[:, 1] = rate
+        prediction[:, 3] = rate / 3.0
+        prediction[CA, 5] = rate / 20.0
+        turn_psd = 0.0
+    flat = (_ORDER + 1, _FLAT)
+    return MotionModels(np.hstack((transition.reshape(flat), noise.reshape(flat))), turn_psd, prediction)
+
+
+def _integrated_white(noise: FloatArray, chain: tuple[int, ...], density: float) -> None:
+    """Add Q of an integrator chain whose last member is driven by white noise.
+
+    Q[i, j] = density dt^(n_i + n_j + 1) / ((n_i + n_j + 1) n_i! n_j!), n the integrations behind the driven one.
+    """
+    factorial = (1.0, 1.0, 2.0)
+    depth = len(chain) - 1
+    for i, row in enumerate(chain):
+        for j, column in enumerate(chain):
+            order = (depth - i) + (depth - j) + 1
+            noise[order, row, column] += density / (order * factorial[depth - i] * factorial[depth - j])
+
+
+def turn_terms(turn: FloatArray, dt: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+    """E = e^(i Omega dt), I = (E - 1) / (i Omega) and dI/dOmega = (dt E - I) / Omega, horizontal plane as complex.
+
+    With w = v_x + i v_y a turning obstacle obeys p' = p + I w and v' = E w, which is (17). Below |Omega dt| = 1e-3
+    the quotients are taken from their series, whose first neglected terms are below 1e-13 of the result.
+    Shapes: ``turn`` and ``dt`` broadcast.
+    """
+    angle = turn * dt
+    rotation = np.exp(1j * angle)
+    magnitude = np.abs(angle)
+    if not magnitude.size or magnitude.min() >= _SERIES_BELOW_RAD:
+        integral = (rotation - 1.0) / (1j * turn)
+        return rotation, integral, (dt * rotation - integral) / turn
+    small = magnitude < _SERIES_BELOW_RAD
+    safe = np.where(small, 1.0, turn)
+    j = 1j * angle
+    integral = np.where(small, dt * (1.0 + j / 2.0 * (1.0 + j / 3.0 * (1.0 + j / 4.0))), (rotation - 1.0) / (1j * safe))
+    series = 1j * dt * dt * (0.5 + j * (1.0 / 3.0 + j * (0.125 + j / 30.0)))
+    return rotation, integral, np.where(small, series, (dt * rotation - integral) / safe)
+
+
+def propagate(
+    x: FloatArray, covariance: FloatArray, dt: FloatArray, models: MotionModels
+) -> tuple[FloatArray, FloatArray]:
+    """x' = F x, P' = J P J^T + Q for every track and model; J = F except CT's column dF/dOmega x.
+
+    Args:
+        x: (M, 3, 10). covariance: (M, 3, 10, 10). dt: (M,) [s]; negative goes back in time, without noise.
+    Returns:
+        new (x, covariance), same shapes.
+    """
+    count = x.shape[0]
+    both = np.empty((count, 2, MODELS, SIZE, SIZE))
+    both.reshape(count, 2 * _FLAT)[:] = _powers(dt) @ models.polynomials
+    jacobian, noise = both[:, 0], both[:, 1]
+    rotation, integral, slope = turn_terms(x[:, CT, TURN], dt)
+    horizontal = jacobian[:, CT, :6].reshape(count, 2, 3, SIZE)[:, :, :2]  # rows p_x, p_y and v_x, v_y
+    turned = np.empty((count, 2), dtype=np.complex128)
+    turned[:, 0], turned[:, 1] = integral, rotation
+    horizontal[..., 3:5] = (turned.view(np.float64) @ _AS_MATRIX).reshape(count, 2, 2, 2)
+    moved = (jacobian @ x[..., None])[..., 0]
+    w = horizontal_velocity(x)
+    turned[:, 0], turned[:, 1] = slope * w, 1j * dt * rotation * w
+    horizontal[..., TURN] = turned.view(np.float64).reshape(count, 2, 2)
+    if models.turn_psd > 0.0:
+        noise[:, CT] += turn_noise(jacobian[:, CT, :, TURN], dt, models.turn_psd)
+    if count and dt.min() < 0.0:
+        noise[dt < 0.0] = 0.0
+    spread = jacobian @ covariance @ jacobian.swapaxes(2, 3)
+    spread += noise
+    return moved, spread
+
+
+def _powers(dt: FloatArray) -> FloatArray:
+    """dt^0 .. dt^5, (M, 6), or (1, 6) where all tracks share one dt, as they do in a frame of one source."""
+    values = dt.tolist()
+    if values and values.count(values[0]) == len(values):
+        dt = dt[:1]
+    return np.asarray(dt[:, None] ** _EXPONENTS)
+
+
+def horizontal_velocity(x: FloatArray) -> ComplexArray:
+    """CT's v_x + i v_y, (M,)."""
+    return np.asarray(x[:, CT, 3] + 1j * x[:, CT, 4])
+
+
+def turn_noise(column: FloatArray, dt: FloatArray, turn_psd: float) -> FloatArray:
+    """Q of a Wiener turn rate: Q = q dt (c c^T o W), c = d(state)/dOmega after dt, c_Omega = 1.
+
+    W holds the ratios of the integrated noise to a constant error of the same size: 1/5 for position (v^2 q dt^5 / 20
+    across the path), 1/3 for velocity (v^2 q dt^3 / 3), 1 for the rate. W is positive semidefinite, and so is Q
+    (Schur product). Exact for a straight path, first order in Omega dt else.
+
+    Shapes: column (M, 10), dt (M,) -> (M, 10, 10).
+    """
+    scaled = column * (turn_psd * np.maximum(dt, 0.0))[:, None]
+    return np.asarray(scaled[:, :, None] * column[:, None, :] * TURN_WEIGHT)
+
+
+def to_common(x: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Every model in [p, v, a, Omega]: CV and CA as they are, CT with centripetal a = Omega e_z x v (18).
+
+    The covariance goes along by the Jacobian, d a / d (v_x, v_y, Omega) = [[0, -Omega, -v_y], [Omega, 0, v_x]].
+    Shapes as in `propagate`; new arrays.
+    """
+    common, spread = x.copy(), covariance.copy()
+    count = x.shape[0]
+    turn, v_x, v_y = x[:, CT, TURN], x[:, CT, 3], x[:, CT, 4]
+    common[:, CT, 6] = -turn * v_y
+    common[:, CT, 7] = turn * v_x
+    slope = np.zeros((count, 2, SIZE))
+    slope[:, 0, 4], slope[:, 0, TURN] = -turn, -v_y
+    slope[:, 1, 3], slope[:, 1, TURN] = turn, v_x
+    rows = slope @ covariance[:, CT]
+    ct = spread[:, CT]
+    ct[:, 6:8, :] = rows
+    ct[:, :, 6:8] = rows.swapaxes(1, 2)
+    ct[:, 6:8, 6:8] = rows @ slope.swapaxes(1, 2)
+    return common, spread
