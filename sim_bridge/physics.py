@@ -4,9 +4,8 @@ Each step: rotor speeds follow their commands with first-order lag; every rotor 
 and turns the body with c k_m w^2; rotor drag F = -k (sum w) v acts in body axes; PyBullet integrates. The vehicle
 is moved by these forces and by contacts alone: nothing here sets its pose or velocity once it is built.
 
-Contacts follow clearance: spheres stand where clearance was taken when PyBullet looks for contacts, and a contact
-with an obstacle acts only from zero distance on (contactProcessingThreshold 0), so that no push of the solver can
-keep a collision from being seen.
+Contacts follow clearance: when PyBullet looks for contacts the spheres stand where clearance was last taken, and it
+makes a contact of two spheres only from zero distance on. So no push can keep a collision from being seen.
 """
 
 from __future__ import annotations
@@ -103,22 +102,36 @@ class World:
         self.touched_ground = self.on_ground
 
     def _build(self, start_enu: Point, start_yaw_rad: float) -> None:
-        client, vehicle = self._client, self.vehicle
+        client = self._client
         pybullet.setTimeStep(1.0 / self.physics_hz, physicsClientId=client)
-        pybullet.setGravity(0.0, 0.0, -vehicle.g_m_s2, physicsClientId=client)
+        pybullet.setGravity(0.0, 0.0, -self.vehicle.g_m_s2, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
         plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
-        self._ground = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
-        self._body = pybullet.createMultiBody(
+        ground = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
+        # rolling friction keeps the landed ball from rolling away
+        pybullet.changeDynamics(
+            ground, -1, lateralFriction=1.0, rollingFriction=1.0, spinningFriction=1.0, physicsClientId=client
+        )
+        self._body = self._build_vehicle(start_enu, start_yaw_rad)
+        self._spheres = [
+            pybullet.createMultiBody(
+                0.0, self._sphere(radius_m), basePosition=motion.position(0.0), physicsClientId=client
+            )
+            for motion, radius_m in zip(self.motions, self.radii_m, strict=True)
+        ]
+
+    def _build_vehicle(self, start_enu: Point, start_yaw_rad: float) -> int:
+        vehicle = self.vehicle
+        body: int = pybullet.createMultiBody(
             baseMass=vehicle.mass_kg,
             baseCollisionShapeIndex=self._sphere(vehicle.radius_m),
             basePosition=start_enu,
             baseOrientation=(0.0, 0.0, math.sin(0.5 * start_yaw_rad), math.cos(0.5 * start_yaw_rad)),
-            physicsClientId=client,
+            physicsClientId=self._client,
         )
-        # a sphere's own inertia is replaced; rolling friction keeps the landed ball from rolling away
+        # PyBullet would take the inertia of the collision sphere and damp 4 % of the speed a second
         pybullet.changeDynamics(
-            self._body,
+            body,
             -1,
             localInertiaDiagonal=vehicle.inertia_kg_m2,
             linearDamping=0.0,
@@ -126,18 +139,9 @@ class World:
             rollingFriction=0.01,
             spinningFriction=0.01,
             activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-            physicsClientId=client,
+            physicsClientId=self._client,
         )
-        pybullet.changeDynamics(
-            self._ground, -1, lateralFriction=1.0, rollingFriction=1.0, spinningFriction=1.0, physicsClientId=client
-        )
-        self._spheres: list[int] = []
-        for motion, radius_m in zip(self.motions, self.radii_m, strict=True):
-            sphere = pybullet.createMultiBody(
-                0.0, self._sphere(radius_m), basePosition=motion.position(0.0), physicsClientId=client
-            )
-            pybullet.changeDynamics(sphere, -1, contactProcessingThreshold=0.0, physicsClientId=client)
-            self._spheres.append(sphere)
+        return body
 
     def _sphere(self, radius_m: float) -> int:
         shape: int = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=radius_m, physicsClientId=self._client)
