@@ -1,0 +1,340 @@
+"""A PX4-style commander as a pure state machine: no I/O, no clock; it is told the state and the time.
+
+Mode changes, arming, takeoff, landing, offboard's proof of life and the failsafe on setpoint loss. The controller
+flies what `target` returns. Behaviour follows PX4's user guide: "Offboard Mode" (setpoints at 2 Hz or more before and
+during the mode), "Takeoff", "Land" (auto-disarm), and COM_OF_LOSS_T, COM_OBL_RC_ACT, COM_DISARM_LAND, COM_DISARM_PRFLT.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from sim_bridge.controller import AccelerationSetpoint, MotorsOff, PositionSetpoint, Setpoint
+from sim_bridge.messages import (
+    FORCE_DISARM,
+    NS_PER_S,
+    Ack,
+    Cmd,
+    Command,
+    Landed,
+    LocalSetpoint,
+    Mode,
+    Reply,
+    Result,
+    Severity,
+    Text,
+    Vec3,
+)
+from sim_bridge.parameters import Parameters
+from sim_bridge.physics import BodyState
+
+HOME_ALTITUDE_AMSL_M = 488.0  # PX4 SITL's home, Zurich
+FRAME_LOCAL_NED = 1
+FORCE_BIT = 0x0200
+YAW_IGNORED = 0x0400
+YAW_RATE_IGNORED = 0x0800
+VELOCITY_IGNORED = 0x0038
+MASKS = (0x0C3F, 0x083F, 0x043F, 0x0C07)  # acceleration; with yaw; with yaw rate; with velocity
+
+STREAM_GAP_NS = NS_PER_S // 2  # 2 Hz
+STREAM_NS = 450_000_000  # half a second of stream, less one period of 20 Hz for jitter
+LANDED_NS = NS_PER_S // 2  # at rest on the ground for this long
+HOVER_NS = NS_PER_S // 2
+REST_M_S = 0.1
+TOUCH_M = 0.03  # above resting height: still on the ground
+ARRIVED_M = 0.05
+LIFT_OFF_M_S2 = 0.2  # offboard setpoints with more upward acceleration leave the ground
+
+_REQUESTABLE = (Mode.HOLD, Mode.TAKEOFF, Mode.LAND, Mode.POSITION, Mode.OFFBOARD)
+
+
+class Autopilot:
+    """Modes, arming and failsafes of one vehicle.
+
+    Args:
+        start_enu: where it starts; above resting height it starts armed, in Hold. Home, from which takeoff
+            altitudes count, is the ground z = 0 below [m].
+        rest_height_m: height of the vehicle's centre above the ground when it stands.
+        yaw_rad: initial heading, counter-clockwise from east.
+    """
+
+    def __init__(self, *, start_enu: Vec3, rest_height_m: float, yaw_rad: float) -> None:
+        airborne = start_enu[2] > rest_height_m + TOUCH_M
+        self.parameters = Parameters()
+        self.home_enu: Vec3 = (start_enu[0], start_enu[1], 0.0)
+        self.mode = Mode.HOLD
+        self.armed = airborne
+        self.landed = Landed.IN_AIR if airborne else Landed.ON_GROUND
+        self.last_setpoint: LocalSetpoint | None = None
+        self._rest_z_m = rest_height_m
+        self._yaw_rad = yaw_rad
+        # what every mode but OFFBOARD flies to
+        self._goal: PositionSetpoint | None = PositionSetpoint(start_enu, yaw_rad) if airborne else None
+        self._armed_ns = 0
+        self._stream_start_ns = 0
+        self._last_setpoint_ns: int | None = None
+        self._refused_ns: int | None = None
+        self._rest_since_ns: int | None = None
+        self._hover_since_ns: int | None = None
+        self._handlers: dict[int, Callable[[Command, BodyState, int], tuple[Result, str]]] = {
+            Cmd.COMPONENT_ARM_DISARM: self._arm_disarm,
+            Cmd.NAV_TAKEOFF: self._takeoff,
+            Cmd.NAV_LAND: self._land,
+            Cmd.DO_SET_MODE: self._set_mode,
+        }
+
+    def command(self, command: Command, state: BodyState, t_ns: int) -> tuple[Reply, ...]:
+        """Carry out a command; one Ack to its sender, with the reason of a refusal as Text."""
+        handler = self._handlers.get(command.command)
+        if handler is None:
+            return (Ack(command.command, Result.UNSUPPORTED, command.sender),)
+        result, reason = handler(command, state, t_ns)
+        ack = Ack(command.command, result, command.sender)
+        return (ack,) if result is Result.ACCEPTED else (Text(Severity.CRITICAL, reason), ack)
+
+    def setpoint(self, setpoint: LocalSetpoint, t_ns: int) -> tuple[Reply, ...]:
+        """Take an external setpoint; one that cannot be flown is dropped whole and does not count as stream."""
+        reason = _refusal(setpoint)
+        if reason:
+            if self._refused_ns is not None and t_ns - self._refused_ns < NS_PER_S:
+                return ()
+            self._refused_ns = t_ns
+            return (Text(Severity.WARNING, f"Setpoint refused: {reason}"),)
+        last = self._last_setpoint_ns
+        if last is None or t_ns - last > STREAM_GAP_NS:
+            self._stream_start_ns = t_ns
+        self._last_setpoint_ns = t_ns
+        self.last_setpoint = setpoint
+        return ()
+
+    def step(self, state: BodyState, t_ns: int) -> tuple[Reply, ...]:
+        """Watch the clock once a control period: failsafe, takeoff, landing, disarming."""
+        replies: list[Reply] = []
+        if self.mode is Mode.OFFBOARD and self.armed and self._setpoint_lost(t_ns):
+            replies.append(self._lose_offboard(state))
+        if self.armed:
+            self._watch_ground(state, t_ns)
+            self._watch_takeoff(state)
+            replies.extend(self._watch_disarm(t_ns))
+        self._watch_hover(state, t_ns)
+        return tuple(replies)
+
+    def target(self, state: BodyState) -> Setpoint:
+        """What the controller flies now."""
+        if not self.armed:
+            return MotorsOff()
+        setpoint = self.last_setpoint
+        if self.mode is Mode.OFFBOARD and setpoint is not None:
+            if self.landed is Landed.ON_GROUND and setpoint.a_enu[2] < LIFT_OFF_M_S2:
+                return MotorsOff()
+            return AccelerationSetpoint(self._acceleration(setpoint, state), self._yaw_rad)
+        if self._goal is None or (self.landed is Landed.ON_GROUND and self.mode is not Mode.TAKEOFF):
+            return MotorsOff()
+        return self._goal
+
+    def turn(self, dt_s: float) -> None:
+        """Let the heading follow the setpoint's yaw, or its yaw rate over ``dt_s``."""
+        setpoint = self.last_setpoint
+        if self.mode is not Mode.OFFBOARD or setpoint is None:
+            return
+        if not setpoint.type_mask & YAW_IGNORED:
+            self._yaw_rad = setpoint.yaw_rad
+        elif not setpoint.type_mask & YAW_RATE_IGNORED:
+            self._yaw_rad = math.remainder(self._yaw_rad + setpoint.yaw_rate_rad_s * dt_s, math.tau)
+
+    def hovering(self, t_ns: int) -> bool:
+        """Airborne in Hold and at rest at the goal for half a second."""
+        return self._hover_since_ns is not None and t_ns - self._hover_since_ns >= HOVER_NS
+
+    @property
+    def airborne(self) -> bool:
+        return self.landed is not Landed.ON_GROUND
+
+    def streaming(self, t_ns: int) -> bool:
+        """A setpoint stream of at least 2 Hz has run for half a second."""
+        last = self._last_setpoint_ns
+        return last is not None and t_ns - last <= STREAM_GAP_NS and t_ns - self._stream_start_ns >= STREAM_NS
+
+    def hold(self, p_enu: Vec3) -> None:
+        """Enter Hold at ``p_enu``."""
+        self._enter(Mode.HOLD, PositionSetpoint(p_enu, self._yaw_rad))
+
+    # --- commands
+
+    def _arm_disarm(self, command: Command, state: BodyState, t_ns: int) -> tuple[Result, str]:
+        if command.params[0] >= 0.5:
+            return self._arm(t_ns)
+        if self.armed and self.airborne and command.params[1] != FORCE_DISARM:
+            return Result.TEMPORARILY_REJECTED, "Disarming denied: not landed"
+        self._disarm()
+        return Result.ACCEPTED, ""
+
+    def _arm(self, t_ns: int) -> tuple[Result, str]:
+        if self.armed:
+            return Result.ACCEPTED, ""
+        if self.mode is Mode.OFFBOARD and not self.streaming(t_ns):
+            return Result.TEMPORARILY_REJECTED, "Arming denied: no offboard setpoints"
+        self.armed = True
+        self._armed_ns = t_ns
+        self._rest_since_ns = None
+        return Result.ACCEPTED, ""
+
+    def _disarm(self) -> None:
+        self.armed = False
+        if self.mode in (Mode.TAKEOFF, Mode.LAND):
+            self.mode = Mode.HOLD
+        self._goal = None
+
+    def _takeoff(self, command: Command, state: BodyState, t_ns: int) -> tuple[Result, str]:
+        if not self.armed:
+            return Result.TEMPORARILY_REJECTED, "Takeoff denied: not armed"
+        altitude_amsl_m = command.params[6]  # NaN: MIS_TAKEOFF_ALT, as MAVSDK asks for it
+        x, y, z = state.p_enu
+        above_home_m = self.parameters["MIS_TAKEOFF_ALT"]
+        if math.isfinite(altitude_amsl_m):
+            above_home_m = altitude_amsl_m - HOME_ALTITUDE_AMSL_M
+        climb_to_m = max(self.home_enu[2] + above_home_m, z if self.airborne else self._rest_z_m + ARRIVED_M)
+        speed_m_s = float(self.parameters["MPC_TKO_SPEED"])
+        self._enter(Mode.TAKEOFF, PositionSetpoint((x, y, climb_to_m), self._yaw_rad, v_max_m_s=speed_m_s))
+        return Result.ACCEPTED, ""
+
+    def _land(self, command: Command, state: BodyState, t_ns: int) -> tuple[Result, str]:
+        x, y, _ = state.p_enu
+        below = (x, y, self.home_enu[2] - 10.0)  # never reached: descends at the speed limit until it stands
+        speed_m_s = float(self.parameters["MPC_LAND_SPEED"])
+        self._enter(Mode.LAND, PositionSetpoint(below, self._yaw_rad, v_max_m_s=speed_m_s))
+        return Result.ACCEPTED, ""
+
+    def _set_mode(self, command: Command, state: BodyState, t_ns: int) -> tuple[Result, str]:
+        flags, main, sub = command.params[:3]
+        if not all(math.isfinite(x) and 0.0 <= x <= 255.0 for x in (flags, main, sub)) or not int(flags) & 1:
+            return Result.DENIED, "Mode denied: expected a custom mode (param1 bit 1)"
+        number = int(main) << 16 | int(sub) << 24
+        mode = next((m for m in _REQUESTABLE if m == number), None)
+        if mode is None:
+            return Result.TEMPORARILY_REJECTED, f"Mode {int(main)}/{int(sub)} denied: not available here"
+        if mode is Mode.OFFBOARD:
+            return self._enter_offboard(t_ns)
+        if mode is Mode.TAKEOFF:
+            return self._takeoff(_takeoff_to_default(command), state, t_ns)
+        if mode is Mode.LAND:
+            return self._land(command, state, t_ns)
+        if self.mode is not mode:
+            self.hold(state.p_enu)
+            self.mode = mode
+        return Result.ACCEPTED, ""
+
+    def _enter_offboard(self, t_ns: int) -> tuple[Result, str]:
+        if not self.streaming(t_ns):
+            return Result.TEMPORARILY_REJECTED, "Offboard denied: no setpoint stream"
+        self.mode = Mode.OFFBOARD
+        return Result.ACCEPTED, ""
+
+    def _enter(self, mode: Mode, goal: PositionSetpoint) -> None:
+        self.mode = mode
+        self._goal = goal
+        self._rest_since_ns = None
+        self._hover_since_ns = None
+
+    # --- watching
+
+    def _setpoint_lost(self, t_ns: int) -> bool:
+        last = self._last_setpoint_ns
+        return last is None or t_ns - last > self.parameters["COM_OF_LOSS_T"] * NS_PER_S
+
+    def _lose_offboard(self, state: BodyState) -> Reply:
+        if self.parameters["COM_OBL_RC_ACT"] == 4:
+            speed_m_s = float(self.parameters["MPC_LAND_SPEED"])
+            x, y, _ = state.p_enu
+            self._enter(
+                Mode.LAND, PositionSetpoint((x, y, self.home_enu[2] - 10.0), self._yaw_rad, v_max_m_s=speed_m_s)
+            )
+            return Text(Severity.CRITICAL, "Failsafe: offboard setpoints lost, landing")
+        self.hold(state.p_enu)
+        return Text(Severity.CRITICAL, "Failsafe: offboard setpoints lost, holding")
+
+    def _watch_ground(self, state: BodyState, t_ns: int) -> None:
+        grounded = state.p_enu[2] < self._rest_z_m + TOUCH_M
+        if not grounded:
+            self._rest_since_ns = None
+            self.landed = {Mode.TAKEOFF: Landed.TAKEOFF, Mode.LAND: Landed.LANDING}.get(self.mode, Landed.IN_AIR)
+            return
+        if self.landed is Landed.ON_GROUND or math.hypot(*state.v_enu) > REST_M_S or not self._descending():
+            self._rest_since_ns = None
+            return
+        if self._rest_since_ns is None:
+            self._rest_since_ns = t_ns
+        if t_ns - self._rest_since_ns >= LANDED_NS:
+            self.landed = Landed.ON_GROUND
+            self._armed_ns = t_ns
+
+    def _descending(self) -> bool:
+        if self.mode is Mode.OFFBOARD and self.last_setpoint is not None:
+            return self.last_setpoint.a_enu[2] < LIFT_OFF_M_S2
+        return self._goal is None or self._goal.p_enu[2] < self._rest_z_m
+
+    def _watch_takeoff(self, state: BodyState) -> None:
+        goal = self._goal
+        if self.mode is not Mode.TAKEOFF or goal is None:
+            return
+        if math.dist(state.p_enu, goal.p_enu) < ARRIVED_M and math.hypot(*state.v_enu) < REST_M_S:
+            self.landed = Landed.IN_AIR
+            self.hold(goal.p_enu)
+
+    def _watch_disarm(self, t_ns: int) -> tuple[Reply, ...]:
+        if self.landed is not Landed.ON_GROUND or self.mode is Mode.TAKEOFF:
+            return ()
+        landing = self.mode is Mode.LAND
+        delay_s = self.parameters["COM_DISARM_LAND" if landing else "COM_DISARM_PRFLT"]
+        if (delay_s > 0 or landing) and t_ns - self._armed_ns >= delay_s * NS_PER_S:
+            self._disarm()
+            return (Text(Severity.INFO, "Disarmed by landing" if landing else "Disarmed by auto preflight disarming"),)
+        return ()
+
+    def _watch_hover(self, state: BodyState, t_ns: int) -> None:
+        goal = self._goal
+        at_rest = (
+            goal is not None
+            and self.mode is Mode.HOLD
+            and self.landed is Landed.IN_AIR
+            and math.dist(state.p_enu, goal.p_enu) < ARRIVED_M
+            and math.hypot(*state.v_enu) < REST_M_S
+        )
+        if not at_rest:
+            self._hover_since_ns = None
+        elif self._hover_since_ns is None:
+            self._hover_since_ns = t_ns
+
+    def _acceleration(self, setpoint: LocalSetpoint, state: BodyState) -> Vec3:
+        """a, or with a velocity setpoint a + k (v_sp - v), k = MPC_XY_VEL_P_ACC."""
+        ax, ay, az = setpoint.a_enu
+        if setpoint.type_mask & VELOCITY_IGNORED:
+            return setpoint.a_enu
+        k = self.parameters["MPC_XY_VEL_P_ACC"]
+        (sx, sy, sz), (vx, vy, vz) = setpoint.v_enu, state.v_enu
+        return (ax + k * (sx - vx), ay + k * (sy - vy), az + k * (sz - vz))
+
+
+def _takeoff_to_default(command: Command) -> Command:
+    """A takeoff to MIS_TAKEOFF_ALT out of a request for the takeoff mode."""
+    return Command(Cmd.NAV_TAKEOFF, (math.nan,) * 7, command.sender)
+
+
+def _refusal(setpoint: LocalSetpoint) -> str:
+    """Why a setpoint cannot be flown, or nothing."""
+    mask = setpoint.type_mask
+    if mask & FORCE_BIT:
+        return f"type_mask 0x{mask:04X} FORCE"
+    if mask not in MASKS:
+        return f"type_mask 0x{mask:04X}"
+    if setpoint.frame != FRAME_LOCAL_NED:
+        return f"frame {setpoint.frame}"
+    used = list(setpoint.a_enu)
+    if not mask & VELOCITY_IGNORED:
+        used += setpoint.v_enu
+    if not mask & YAW_IGNORED:
+        used.append(setpoint.yaw_rad)
+    if not mask & YAW_RATE_IGNORED:
+        used.append(setpoint.yaw_rate_rad_s)
+    return "" if all(map(math.isfinite, used)) else "not a finite number"

@@ -1,0 +1,193 @@
+"""`sim-bridge`: fly a scenario behind MAVLink and Zenoh, or print one as it will be flown."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import IO, Any
+
+from sim_bridge.errors import ScenarioError, SimError
+from sim_bridge.flight import Flight
+from sim_bridge.lockstep_runner import Lockstep
+from sim_bridge.messages import NS_PER_S
+from sim_bridge.placement import Resolved, describe, resolve
+from sim_bridge.runner import RealTime, Trace, Wires
+from sim_bridge.scenario import load_scenario
+
+DONE, FAILED, USAGE = 0, 1, 2
+_NO_ZENOH = "none"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit status: 0 done, 1 the flight failed, 2 wrong usage or configuration."""
+    arguments = _parser().parse_args(argv)
+    try:
+        status: int = arguments.run(arguments)
+    except ScenarioError as error:
+        print(f"sim-bridge: {error}", file=sys.stderr)
+        return USAGE
+    except SimError as error:
+        print(f"sim-bridge: {error}", file=sys.stderr)
+        return FAILED
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sim-bridge",
+        description="A PyBullet Crazyflie behind a PX4-style MAVLink autopilot, among moving obstacles.",
+        epilog="example: sim-bridge run --scenario demo --seed 1 --json",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    run = commands.add_parser(
+        "run", help="fly a scenario", epilog="example: sim-bridge run --scenario linear --lockstep --trace flight.jsonl"
+    )
+    _add_scenario(run)
+    run.add_argument("--lockstep", action="store_true", help="wait for the companion at each tick, not for the clock")
+    run.add_argument("--stay", action="store_true", help="fly on after the end of the flight, until a signal")
+    run.add_argument("--onboard-port", type=_port, default=14540, help="UDP port of the companion (default 14540)")
+    run.add_argument("--gcs-port", type=_port, default=14550, help="UDP port of the ground station (default 14550)")
+    run.add_argument(
+        "--zenoh-listen",
+        default="tcp/127.0.0.1:7447",
+        metavar="ENDPOINT",
+        help="where Zenoh listens (default tcp/127.0.0.1:7447), or none",
+    )
+    run.add_argument("--trace", type=Path, metavar="FILE", help="write true positions as JSON lines")
+    run.set_defaults(run=_run)
+    show = commands.add_parser(
+        "scenario",
+        help="print a scenario as it will be flown",
+        epilog="example: sim-bridge scenario demo --seed 1 --json",
+    )
+    _add_scenario(show, positional=True)
+    show.set_defaults(run=_show)
+    return parser
+
+
+def _add_scenario(parser: argparse.ArgumentParser, *, positional: bool = False) -> None:
+    if positional:
+        parser.add_argument("scenario", help="a shipped scenario's name, or a TOML file")
+    else:
+        parser.add_argument("--scenario", default="demo", help="a shipped scenario, or a TOML file (default demo)")
+    parser.add_argument("--seed", type=_seed, default=0, help="fixes every draw (default 0)")
+    parser.add_argument("--no-obstacles", action="store_true", help="leave the obstacles out")
+    parser.add_argument("--name", default="uav1", help="vehicle name, the Zenoh prefix is uav/NAME (default uav1)")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 65535:
+        raise argparse.ArgumentTypeError(f"expected a port, 1 to 65535, got {text}")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or above, got {text}")
+    return int(text)
+
+
+def _resolved(arguments: argparse.Namespace) -> Resolved:
+    name, scenario = load_scenario(arguments.scenario)
+    return resolve(name, scenario, arguments.seed, obstacles=not arguments.no_obstacles)
+
+
+def _show(arguments: argparse.Namespace) -> int:
+    described = describe(_resolved(arguments), arguments.name)
+    print(json.dumps(described, indent=None if arguments.json else 2))
+    return DONE
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    resolved = _resolved(arguments)
+    endpoint = None if arguments.zenoh_listen == _NO_ZENOH else arguments.zenoh_listen
+    if arguments.lockstep and endpoint is None:
+        raise ScenarioError("--zenoh-listen none: expected an endpoint with --lockstep")
+    if arguments.onboard_port == arguments.gcs_port:
+        raise ScenarioError(f"--gcs-port {arguments.gcs_port}: expected another port than --onboard-port")
+    with ExitStack() as stack:
+        trace = Trace(stack.enter_context(_opened(arguments.trace)))
+        wires = Wires(
+            resolved,
+            onboard_port=arguments.onboard_port,
+            ground_port=arguments.gcs_port,
+            endpoint=endpoint,
+            prefix=f"uav/{arguments.name}",
+            lockstep=arguments.lockstep,
+        )
+        stack.callback(wires.close)
+        flight = Flight(resolved)
+        stack.callback(flight.close)
+        kind = Lockstep if arguments.lockstep else RealTime
+        runner = kind(flight, wires, trace=trace, progress=_progress(), stay=arguments.stay)
+        with _stopped_by_signals(runner.stop):
+            summary = runner.run()
+    _report(summary, as_json=arguments.json)
+    return FAILED if summary["collided"] or summary["ended"] == "timeout" else DONE
+
+
+@contextmanager
+def _opened(path: Path | None) -> Iterator[IO[bytes] | None]:
+    if path is None:
+        yield None
+        return
+    try:
+        file = path.open("wb")
+    except OSError as error:
+        raise ScenarioError(f"--trace {path}: cannot be written ({error.strerror})") from None
+    with file:
+        yield file
+
+
+@contextmanager
+def _stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM end the run instead of the process."""
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _progress() -> Callable[[Flight], None]:
+    """One line that is rewritten, on a terminal; twice a second of vehicle time."""
+    if not sys.stderr.isatty():
+        return lambda flight: None
+
+    def show(flight: Flight) -> None:
+        if flight.t_ns % (NS_PER_S // 2):
+            return
+        line = flight.trace_line()
+        clearance_m = line["clearance_m"]
+        nearest = "" if clearance_m is None else f"  nearest obstacle {clearance_m:5.2f} m"
+        x, y, z = line["position"]
+        text = f"{flight.t_ns / NS_PER_S:7.1f} s  {line['mode']:8s} ({x:6.2f} {y:6.2f} {z:6.2f}) m{nearest}"
+        print(f"\r{text}\033[K", end="", file=sys.stderr, flush=True)
+
+    return show
+
+
+def _report(summary: dict[str, Any], *, as_json: bool) -> None:
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    if as_json:
+        print(json.dumps(summary))
+        return
+    for key, value in summary.items():
+        print(f"{key:18s} {json.dumps(value)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

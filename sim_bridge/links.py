@@ -1,0 +1,121 @@
+"""The autopilot's two UDP links, as PX4 SITL has them, and the rules by which packets pass between them.
+
+Each link sends to 127.0.0.1:PORT from a socket of its own and answers whoever speaks to that socket. A packet that
+is not for the autopilot alone goes on to the other link: broadcasts always, addressed ones where the addressee was
+heard there. Nothing goes back to the link it came from, and nothing that claims to be the autopilot is passed on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator
+from enum import Enum
+from typing import TypeAlias
+
+from sim_bridge.mavlink import ID, Decoder, Encoder, Packet
+from sim_bridge.messages import Sender
+
+TIMESYNC = 111
+_DATAGRAM = 65535
+_PER_DRAIN = 256  # so that a flood cannot keep the simulator from flying
+_PEERS = 8
+
+Address: TypeAlias = tuple[str, int]
+
+
+class LinkName(Enum):
+    ONBOARD = "onboard"
+    GROUND = "ground station"
+
+
+class Link:
+    """One UDP endpoint: who listens there, whom we heard, our numbering of messages."""
+
+    def __init__(self, name: LinkName, port: int, host: str = "127.0.0.1") -> None:
+        self.name = name
+        self.port = port
+        self.encoder = Encoder()
+        self.heard: set[Sender] = set()
+        self._home: Address = (host, port)
+        self._peers: list[Address] = []
+        self._decoder = Decoder()
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.socket.bind((host, 0))
+
+    @property
+    def damaged(self) -> int:
+        """Runs of bytes that were no MAVLink."""
+        return self._decoder.damaged
+
+    def send(self, data: bytes) -> None:
+        """To the configured port and to everybody else who spoke to this link; nobody there is no error."""
+        for address in (self._home, *self._peers):
+            with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
+                self.socket.sendto(data, address)
+
+    def receive(self) -> Iterator[Packet]:
+        """Packets that have arrived, without waiting."""
+        for _ in range(_PER_DRAIN):
+            try:
+                data, address = self.socket.recvfrom(_DATAGRAM)
+            except BlockingIOError:
+                return
+            except ConnectionRefusedError:
+                continue
+            fresh = address != self._home and address not in self._peers
+            for packet in self._decoder.packets(data):
+                if fresh:
+                    self._peers = [*self._peers[-_PEERS + 1 :], address]
+                    fresh = False
+                self.heard.add(packet.sender)
+                yield packet
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+class Router:
+    """The two links together."""
+
+    def __init__(self, onboard_port: int, ground_port: int) -> None:
+        self.onboard = Link(LinkName.ONBOARD, onboard_port)
+        self.ground = Link(LinkName.GROUND, ground_port)
+        self.links = (self.onboard, self.ground)
+
+    def other(self, link: Link) -> Link:
+        return self.ground if link is self.onboard else self.onboard
+
+    def receive(self) -> Iterator[tuple[Link, Packet]]:
+        """What has arrived on both links, without waiting."""
+        for link in self.links:
+            for packet in link.receive():
+                if packet.sender != ID:
+                    yield link, packet
+
+    def forward(self, link: Link, packet: Packet) -> bool:
+        """Pass a packet that came in on ``link`` on to the other one, if the rules say so."""
+        other = self.other(link)
+        passes = _passes(packet, other.heard)
+        if passes:
+            other.send(packet.raw)
+        return passes
+
+    def close(self) -> None:
+        for link in self.links:
+            link.close()
+
+
+def for_autopilot(target: Sender) -> bool:
+    """Addressed to everybody, to our whole system, or to us."""
+    return target.system in (0, ID.system) and target.component in (0, ID.component)
+
+
+def _passes(packet: Packet, heard: set[Sender]) -> bool:
+    target = packet.target
+    if target.system == 0:
+        return packet.message_id != TIMESYNC  # the autopilot is the time base and answers alone
+    if target.component == 0:
+        return any(sender.system == target.system for sender in heard)
+    return target in heard

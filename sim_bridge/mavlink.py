@@ -1,0 +1,218 @@
+"""MAVLink 2 to the autopilot's values and back; the only place of the simulator where NED and FRD exist.
+
+pymavlink's generated dialect is the codec, no socket and no ``mavutil``. A vector: (x, y, z) ENU <-> (y, x, -z) NED;
+a heading: pi/2 - yaw. System 1, component 1, as PX4's first SITL instance.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from sim_bridge.messages import (
+    Ack,
+    Cmd,
+    Command,
+    Incoming,
+    LocalSetpoint,
+    ParamRead,
+    ParamWrite,
+    Sender,
+    Text,
+    Timesync,
+    Vec3,
+)
+
+SYSTEM, COMPONENT = 1, 1
+ID = Sender(SYSTEM, COMPONENT)
+_V1, _V2, _SIGNED = 0xFE, 0xFD, 0x01
+_INT_TYPES = range(1, 9)  # MAV_PARAM_TYPE UINT8 .. INT64
+_PARAM_INT32, _PARAM_REAL32 = 6, 9
+_SQRT_HALF = math.sqrt(0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One intact message as it came: its bytes for forwarding, its meaning where the autopilot knows it."""
+
+    raw: bytes
+    message_id: int
+    sender: Sender
+    target: Sender  # 0 where the message has no such field: everybody
+    content: Incoming | None
+    time_boot_ms: int | None = None  # of a setpoint, and command of a COMMAND_ACK below: what lockstep waits for
+    ack_of: int | None = None
+
+
+class Decoder:
+    """Datagrams to packets. Damaged bytes are skipped and counted; nothing here raises on them."""
+
+    def __init__(self) -> None:
+        self._mav = dialect.MAVLink(None)
+        self.damaged = 0
+
+    def packets(self, datagram: bytes) -> Iterator[Packet]:
+        """Every intact packet of one datagram; a packet never spans two datagrams."""
+        at = 0
+        while at < len(datagram):
+            size = _packet_size(datagram, at)
+            packet = self._decode(datagram[at : at + size]) if size else None
+            if packet is None:
+                self.damaged += 1
+                at += 1 + _to_next_marker(datagram, at + 1)
+                continue
+            yield packet
+            at += size
+
+    def _decode(self, raw: bytes) -> Packet | None:
+        try:
+            message = self._mav.decode(bytearray(raw))
+        except (dialect.MAVError, struct.error, ValueError):
+            return None
+        sender = Sender(raw[5], raw[6]) if raw[0] == _V2 else Sender(raw[3], raw[4])
+        target = Sender(getattr(message, "target_system", 0), getattr(message, "target_component", 0))
+        read = _READERS.get(message.get_type())
+        return Packet(
+            raw,
+            message.get_msgId(),
+            sender,
+            target,
+            read(message, sender) if read else None,
+            getattr(message, "time_boot_ms", None),
+            message.command if message.get_type() == "COMMAND_ACK" else None,
+        )
+
+
+def _packet_size(datagram: bytes, at: int) -> int:
+    """Length of the packet that starts at ``at``, 0 where none does or it is cut short."""
+    left = len(datagram) - at
+    if left >= 12 and datagram[at] == _V2:
+        size = 12 + datagram[at + 1] + (13 if datagram[at + 2] & _SIGNED else 0)
+    elif left >= 8 and datagram[at] == _V1:
+        size = 8 + datagram[at + 1]
+    else:
+        return 0
+    return size if size <= left else 0
+
+
+def _to_next_marker(datagram: bytes, start: int) -> int:
+    for at in range(start, len(datagram)):
+        if datagram[at] in (_V1, _V2):
+            return at - start
+    return len(datagram) - start
+
+
+def _command_long(m: Any, sender: Sender) -> Command:
+    params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
+    return Command(m.command, params, sender, m.target_system, m.target_component)
+
+
+def _command_int(m: Any, sender: Sender) -> Command:
+    params = (m.param1, m.param2, m.param3, m.param4, float(m.x), float(m.y), m.z)
+    return Command(m.command, params, sender, m.target_system, m.target_component)
+
+
+def _set_mode(m: Any, sender: Sender) -> Command:
+    main, sub = float(m.custom_mode >> 16 & 0xFF), float(m.custom_mode >> 24)
+    params = (float(m.base_mode), main, sub, 0.0, 0.0, 0.0, 0.0)
+    return Command(Cmd.DO_SET_MODE, params, sender, m.target_system, COMPONENT)
+
+
+def _setpoint(m: Any, sender: Sender) -> LocalSetpoint:
+    return LocalSetpoint(
+        time_boot_ms=m.time_boot_ms,
+        frame=m.coordinate_frame,
+        type_mask=m.type_mask,
+        p_enu=swap_ned_enu((m.x, m.y, m.z)),
+        v_enu=swap_ned_enu((m.vx, m.vy, m.vz)),
+        a_enu=swap_ned_enu((m.afx, m.afy, m.afz)),
+        yaw_rad=0.5 * math.pi - m.yaw,
+        yaw_rate_rad_s=-m.yaw_rate,
+        sender=sender,
+    )
+
+
+def _timesync(m: Any, sender: Sender) -> Timesync | None:
+    return Timesync(m.tc1, m.ts1, sender) if m.tc1 == 0 else None
+
+
+def _param_set(m: Any, sender: Sender) -> ParamWrite:
+    if m.param_type in _INT_TYPES:
+        return ParamWrite(m.param_id, struct.unpack("<i", struct.pack("<f", m.param_value))[0], is_int=True)
+    return ParamWrite(m.param_id, m.param_value, is_int=False)
+
+
+_READERS: dict[str, Callable[[Any, Sender], Incoming | None]] = {
+    "COMMAND_LONG": _command_long,
+    "COMMAND_INT": _command_int,
+    "SET_MODE": _set_mode,
+    "SET_POSITION_TARGET_LOCAL_NED": _setpoint,
+    "TIMESYNC": _timesync,
+    "PARAM_REQUEST_READ": lambda m, sender: ParamRead("" if m.param_index >= 0 else m.param_id, m.param_index),
+    "PARAM_REQUEST_LIST": lambda m, sender: ParamRead("", -1),
+    "PARAM_SET": _param_set,
+}
+
+
+class Encoder:
+    """Values to bytes, numbered for one link."""
+
+    def __init__(self) -> None:
+        self._mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+
+    def pack(self, message: Any) -> bytes:
+        """Bytes of a pymavlink message object with this link's next sequence number."""
+        raw: bytes = message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) & 0xFF
+        return raw
+
+    def ack(self, ack: Ack) -> bytes:
+        to = ack.receiver
+        return self.pack(
+            dialect.MAVLink_command_ack_message(ack.command, int(ack.result), 0, 0, to.system, to.component)
+        )
+
+    def text(self, text: Text) -> bytes:
+        return self.pack(dialect.MAVLink_statustext_message(int(text.severity), text.text.encode()[:50]))
+
+    def timesync(self, request: Timesync, now_ns: int) -> bytes:
+        to = request.sender
+        return self.pack(dialect.MAVLink_timesync_message(now_ns, request.ts1, to.system, to.component))
+
+    def param(self, name: str, value: float | int, index: int, count: int) -> bytes:
+        if isinstance(value, int):
+            wire, kind = struct.unpack("<f", struct.pack("<i", value))[0], _PARAM_INT32
+        else:
+            wire, kind = value, _PARAM_REAL32
+        return self.pack(dialect.MAVLink_param_value_message(name.encode(), wire, kind, count, index))
+
+    def message_interval(self, message_id: int, interval_us: int) -> bytes:
+        return self.pack(dialect.MAVLink_message_interval_message(message_id, interval_us))
+
+
+def swap_ned_enu(v: Vec3) -> Vec3:
+    """NED components of an ENU vector, and the other way round.
+
+    >>> swap_ned_enu((1.0, 2.0, 3.0))
+    (2.0, 1.0, -3.0)
+    """
+    x, y, z = v
+    return (y, x, -z)
+
+
+def q_ned_from_frd(q_enu_from_flu: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """MAVLink's attitude (w, x, y, z): half a turn about (1, 1, 0), times q, times half a turn about x, multiplied out.
+
+    Level and facing east is a heading of 90 degrees:
+
+    >>> [round(x, 4) for x in q_ned_from_frd((1.0, 0.0, 0.0, 0.0))]
+    [0.7071, 0.0, 0.0, 0.7071]
+    """
+    w, x, y, z = q_enu_from_flu
+    s = _SQRT_HALF if w + z >= 0.0 else -_SQRT_HALF
+    return (s * (w + z), s * (x + y), s * (x - y), s * (w - z))

@@ -1,0 +1,149 @@
+"""What the autopilot is told and what it answers: ENU, SI, integer nanoseconds since boot; no MAVLink bytes.
+
+Numbers are those of MAVLink's common dialect (MAV_CMD, MAV_RESULT, MAV_SEVERITY, MAV_LANDED_STATE).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TypeAlias
+
+Vec3: TypeAlias = tuple[float, float, float]
+
+NS_PER_S = 1_000_000_000
+
+
+class Mode(IntEnum):
+    """PX4's custom_mode: main << 16 | sub << 24 (px4_custom_mode.h)."""
+
+    MANUAL = 1 << 16
+    ALTITUDE = 2 << 16
+    POSITION = 3 << 16
+    TAKEOFF = 4 << 16 | 2 << 24
+    HOLD = 4 << 16 | 3 << 24
+    LAND = 4 << 16 | 6 << 24
+    OFFBOARD = 6 << 16
+    STABILIZED = 7 << 16
+
+
+class Landed(IntEnum):
+    """MAV_LANDED_STATE."""
+
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKEOFF = 3
+    LANDING = 4
+
+
+class Result(IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+
+
+class Severity(IntEnum):
+    """MAV_SEVERITY."""
+
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    INFO = 6
+
+
+class Cmd(IntEnum):
+    """The MAV_CMDs that something here answers."""
+
+    NAV_LAND = 21
+    NAV_TAKEOFF = 22
+    NAV_GUIDED_ENABLE = 92
+    DO_SET_MODE = 176
+    COMPONENT_ARM_DISARM = 400
+    GET_MESSAGE_INTERVAL = 510
+    SET_MESSAGE_INTERVAL = 511
+    REQUEST_MESSAGE = 512
+
+
+FORCE_DISARM = 21196.0  # param2 of COMPONENT_ARM_DISARM
+
+
+@dataclass(frozen=True, slots=True)
+class Sender:
+    system: int
+    component: int
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """COMMAND_LONG, COMMAND_INT or SET_MODE, addressed to (``target_system``, ``target_component``)."""
+
+    command: int
+    params: tuple[float, float, float, float, float, float, float]
+    sender: Sender
+    target_system: int = 1
+    target_component: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LocalSetpoint:
+    """SET_POSITION_TARGET_LOCAL_NED turned into ENU. Fields that the mask ignores may hold anything."""
+
+    time_boot_ms: int
+    frame: int  # MAV_FRAME
+    type_mask: int  # POSITION_TARGET_TYPEMASK
+    p_enu: Vec3  # [m]
+    v_enu: Vec3  # [m/s]
+    a_enu: Vec3  # [m/s^2], gravity excluded
+    yaw_rad: float  # counter-clockwise from east
+    yaw_rate_rad_s: float
+    sender: Sender = Sender(0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Timesync:
+    """A request (tc1 = 0) of a peer that wants our clock."""
+
+    tc1: int
+    ts1: int
+    sender: Sender
+
+
+@dataclass(frozen=True, slots=True)
+class ParamRead:
+    """PARAM_REQUEST_READ by name, or by index where ``name`` is empty; ``index`` -1 with an empty name lists all."""
+
+    name: str
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class ParamWrite:
+    name: str
+    value: float | int
+    is_int: bool
+
+
+Incoming: TypeAlias = Command | LocalSetpoint | Timesync | ParamRead | ParamWrite
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """COMMAND_ACK to ``receiver``."""
+
+    command: int
+    result: Result
+    receiver: Sender
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """STATUSTEXT to everybody."""
+
+    severity: Severity
+    text: str
+
+
+Reply: TypeAlias = Ack | Text

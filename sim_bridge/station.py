@@ -1,0 +1,170 @@
+"""The autopilot on its links: commands and parameters in, acknowledgements, announcements and streams out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sim_bridge.flight import Flight
+from sim_bridge.links import Link, Router, for_autopilot
+from sim_bridge.mavlink import Packet
+from sim_bridge.messages import (
+    Ack,
+    Cmd,
+    Command,
+    LocalSetpoint,
+    ParamRead,
+    ParamWrite,
+    Reply,
+    Result,
+    Text,
+    Timesync,
+)
+from sim_bridge.parameters import NAMES
+from sim_bridge.telemetry import (
+    ALIVE,
+    ATTITUDE_QUATERNION,
+    BUILDERS,
+    EXTENDED_SYS_STATE,
+    HEARTBEAT,
+    LOCAL_POSITION_NED,
+    Moment,
+    Streams,
+    build,
+    ground_rates_hz,
+    onboard_rates_hz,
+)
+
+_LOCKSTEP_PINNED = frozenset({HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED})
+
+
+class Station:
+    """What the two links see of one flight.
+
+    Args:
+        clock_ns: the vehicle's clock now, for TIMESYNC (finer than physics steps in real time).
+        lockstep: pins the heartbeat and the state messages to their default rates.
+    """
+
+    def __init__(self, flight: Flight, router: Router, *, clock_ns: Callable[[], int], lockstep: bool) -> None:
+        self._flight = flight
+        self._router = router
+        self._clock_ns = clock_ns
+        scenario = flight.resolved.scenario
+        pinned = _LOCKSTEP_PINNED if lockstep else frozenset()
+        self._streams = {
+            router.onboard: Streams(onboard_rates_hz(scenario.control_hz), max_hz=scenario.physics_hz, pinned=pinned),
+            router.ground: Streams(ground_rates_hz(), max_hz=scenario.physics_hz),
+        }
+        self._announced = self._status()
+
+    def handle(self, link: Link, packet: Packet) -> tuple[Reply, ...]:
+        """Act on what is meant for the autopilot, answer on the link it came from; returns the answers."""
+        content = packet.content
+        if content is None or not for_autopilot(packet.target):
+            return ()
+        replies: tuple[Reply, ...] = ()
+        if isinstance(content, LocalSetpoint):
+            replies = self._flight.autopilot.setpoint(content, self._flight.t_ns)
+        elif isinstance(content, Command):
+            replies = self._command(link, content)
+        elif isinstance(content, Timesync):
+            link.send(link.encoder.timesync(content, self._clock_ns()))
+        elif isinstance(content, ParamRead):
+            self._read_parameters(link, content)
+        else:
+            self._write_parameter(content)
+        self.say(replies, link)
+        self.announce()
+        return replies
+
+    def say(self, replies: tuple[Reply, ...], link: Link | None = None) -> None:
+        """Acknowledgements on ``link``, texts on both."""
+        for reply in replies:
+            if isinstance(reply, Text):
+                for each in self._router.links:
+                    each.send(each.encoder.text(reply))
+            elif link is not None:
+                link.send(link.encoder.ack(reply))
+
+    def announce(self) -> None:
+        """At once: a heartbeat at a change of mode or arming, EXTENDED_SYS_STATE at a change of landed state."""
+        status = self._status()
+        if status == self._announced:
+            return
+        if status[:2] != self._announced[:2]:
+            self.send(HEARTBEAT)
+        if status[2] != self._announced[2]:
+            self.send(EXTENDED_SYS_STATE)
+        self._announced = status
+
+    def stream(self) -> None:
+        """Send what is due on each link."""
+        t_ns = self._flight.t_ns
+        now: Moment | None = None
+        for link, streams in self._streams.items():
+            for message_id in streams.due(t_ns):
+                now = self._moment() if now is None else now
+                self._send_one(link, message_id, now)
+
+    def stay_alive(self) -> None:
+        """While time is held: a heartbeat on both links, and what tells the ground station that we are healthy."""
+        now = self._moment()
+        self._send_one(self._router.onboard, HEARTBEAT, now)
+        for message_id in ALIVE:
+            self._send_one(self._router.ground, message_id, now)
+
+    def send(self, message_id: int) -> None:
+        """One message now, on both links."""
+        now = self._moment()
+        for link in self._router.links:
+            self._send_one(link, message_id, now)
+
+    def _send_one(self, link: Link, message_id: int, now: Moment) -> None:
+        data = build(message_id, now, link.encoder)
+        if data is not None:
+            link.send(data)
+
+    def _moment(self) -> Moment:
+        return Moment(self._flight.t_ns, self._flight.state, self._flight.autopilot)
+
+    def _status(self) -> tuple[int, bool, int]:
+        autopilot = self._flight.autopilot
+        return (int(autopilot.mode), autopilot.armed, int(autopilot.landed))
+
+    def _command(self, link: Link, command: Command) -> tuple[Reply, ...]:
+        streams = self._streams[link]
+        message_id = int(command.params[0]) if abs(command.params[0]) < 1 << 24 else -1
+        if command.command == Cmd.SET_MESSAGE_INTERVAL:
+            granted = streams.request(message_id, command.params[1])
+        elif command.command == Cmd.GET_MESSAGE_INTERVAL:
+            link.send(link.encoder.message_interval(message_id & 0xFFFF, streams.interval_us(message_id)))
+            granted = message_id in BUILDERS
+        elif command.command == Cmd.REQUEST_MESSAGE:
+            granted = message_id in BUILDERS
+            if granted:
+                self._send_one(link, message_id, self._moment())
+        else:
+            return self._flight.autopilot.command(command, self._flight.state, self._flight.t_ns)
+        return (Ack(command.command, Result.ACCEPTED if granted else Result.DENIED, command.sender),)
+
+    def _read_parameters(self, link: Link, wanted: ParamRead) -> None:
+        if wanted.name:
+            names: tuple[str, ...] = (wanted.name,) if wanted.name in NAMES else ()
+        elif wanted.index >= 0:
+            names = NAMES[wanted.index : wanted.index + 1]
+        else:
+            names = NAMES
+        for name in names:
+            link.send(self._param_value(link, name))
+
+    def _write_parameter(self, wanted: ParamWrite) -> None:
+        """The new value, or the unchanged one where it was refused, goes to everybody."""
+        if wanted.name not in NAMES:
+            return
+        self._flight.autopilot.parameters.write(wanted.name, wanted.value, is_int=wanted.is_int)
+        for link in self._router.links:
+            link.send(self._param_value(link, wanted.name))
+
+    def _param_value(self, link: Link, name: str) -> bytes:
+        value = self._flight.autopilot.parameters[name]
+        return link.encoder.param(name, value, NAMES.index(name), len(NAMES))
