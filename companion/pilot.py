@@ -98,6 +98,10 @@ class Pilot:
         self._anchor: Vec3 | None = None
         self._task: Task | None = None
 
+    @property
+    def track_count(self) -> int:
+        return len(self._tracker.table())
+
     def step(self, inputs: PilotInput, *, sent: bool = True) -> PilotOutput:
         """The safe acceleration for one tick.
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from companion.config import Config
-from companion.link import mavlink
+from companion.link import mav
+from companion.link.decode import CommandRefused, reposition_target
 from companion.link.events import Attitude, Command, Heartbeat, LandedState, Position
 from companion.link.events import Event as LinkEvent
-from companion.link.mavlink import CommandRefused, MavlinkCodec, reposition_target
+from companion.link.mavlink import MavlinkCodec
 from companion.profiles import ModeRequest
 from companion.state import FLYING, Event, Situation, State, advance, refusal
 from companion.types import NS_PER_S, Vec3, VehicleState
@@ -23,9 +24,9 @@ INTERVAL_RETRY_NS = 2 * NS_PER_S
 EXTENDED_SYS_STATE_HZ = 2.0
 
 _SEVERITY = {
-    State.FAULT: mavlink.SEVERITY_CRITICAL,
-    State.HOLD: mavlink.SEVERITY_WARNING,
-    State.OVERRIDDEN: mavlink.SEVERITY_NOTICE,
+    State.FAULT: mav.SEVERITY_CRITICAL,
+    State.HOLD: mav.SEVERITY_WARNING,
+    State.OVERRIDDEN: mav.SEVERITY_NOTICE,
 }
 
 
@@ -44,7 +45,7 @@ class VehicleSession:
         self.situation = Situation()
         self.armed = False
         self.custom_mode: int | None = None
-        self.vehicle: VehicleState | None = None
+        self._stamp_ns = 0  # of the newest vehicle state
         self._attitude: Attitude | None = None
         self._system: int | None = None
         self._candidates: dict[int, int] = {}  # system -> first heard
@@ -100,26 +101,28 @@ class VehicleSession:
 
     # what comes in
 
-    def handle(self, event: LinkEvent, now_ns: int) -> bool:
-        """Take one MAVLink event; True where it brought a new vehicle state."""
+    def handle(self, event: LinkEvent, now_ns: int) -> VehicleState | None:
+        """Take one MAVLink event; the vehicle state it completes, if it does."""
         match event:
             case Heartbeat():
                 self._on_heartbeat(event, now_ns)
             case Attitude() if self._is_ours(event.system):
                 self._attitude = event
             case Position() if self._is_ours(event.system):
-                return self._on_position(event, now_ns)
+                return self._on_position(event)
             case LandedState() if self._is_ours(event.system):
                 self._on_landed(event)
             case Command():
                 self._on_command(event, now_ns)
             case _:
                 pass
-        return False
+        return None
 
-    def set_vehicle(self, vehicle: VehicleState, now_ns: int) -> None:
-        """A vehicle state from wherever it came."""
-        self.vehicle = vehicle
+    def heard_vehicle(self, vehicle: VehicleState, now_ns: int) -> None:
+        """A vehicle state arrived, from MAVLink or Zenoh."""
+        if vehicle.stamp_ns < self._stamp_ns - NS_PER_S:
+            self._intervals_ns = None  # the boot clock went back: a reboot forgets message intervals
+        self._stamp_ns = vehicle.stamp_ns
         self._state_ns = now_ns
 
     def poll(self, now_ns: int) -> None:
@@ -142,7 +145,7 @@ class VehicleSession:
         self.situation = advance(self.situation, event, engage_by=self._config.engage_by, detail=detail)
 
     def _on_heartbeat(self, beat: Heartbeat, now_ns: int) -> None:
-        if beat.autopilot == mavlink.AUTOPILOT_INVALID:
+        if beat.autopilot == mav.AUTOPILOT_INVALID:
             return
         wanted = self._config.mavlink.system_id
         if self._system is None:
@@ -173,33 +176,27 @@ class VehicleSession:
         if now_ns - first_ns >= LATCH_NS:
             self._take_system(system)
 
-    def _on_position(self, position: Position, now_ns: int) -> bool:
-        if self.vehicle is not None and position.stamp_ns < self.vehicle.stamp_ns - NS_PER_S:
-            self._intervals_ns = None  # the boot clock went back: a reboot
+    def _on_position(self, position: Position) -> VehicleState | None:
         if self._attitude is None:
-            return False
-        self.set_vehicle(
-            VehicleState(
-                position.stamp_ns, position.p_enu, position.v_enu, self._attitude.q_enu_from_flu, position.p_std_m
-            ),
-            now_ns,
+            return None
+        return VehicleState(
+            position.stamp_ns, position.p_enu, position.v_enu, self._attitude.q_enu_from_flu, position.p_std_m
         )
-        return True
 
     def _on_landed(self, landed: LandedState) -> None:
         if landed.airborne is not None and landed.airborne != self.situation.airborne:
             self._event(Event.AIRBORNE if landed.airborne else Event.LANDED)
 
     def _on_command(self, command: Command, now_ns: int) -> None:
-        result = mavlink.RESULT_UNSUPPORTED
-        if command.command == mavlink.CMD_NAV_GUIDED_ENABLE:
+        result = mav.RESULT_UNSUPPORTED
+        if command.command == mav.CMD_NAV_GUIDED_ENABLE:
             if command.params[0] >= 0.5:
                 refused = self.engage(now_ns)
-                result = mavlink.RESULT_ACCEPTED if refused is None else mavlink.RESULT_TEMPORARILY_REJECTED
+                result = mav.RESULT_ACCEPTED if refused is None else mav.RESULT_TEMPORARILY_REJECTED
             else:
                 self.release(now_ns)
-                result = mavlink.RESULT_ACCEPTED
-        elif command.command == mavlink.CMD_DO_REPOSITION:
+                result = mav.RESULT_ACCEPTED
+        elif command.command == mav.CMD_DO_REPOSITION:
             result = self._reposition(command)
         self._outgoing.append(self._codec.encode_command_ack(command, result))
 
@@ -208,7 +205,7 @@ class VehicleSession:
             target_enu = reposition_target(command)
         except CommandRefused as refused:
             return refused.result
-        return mavlink.RESULT_ACCEPTED if self._on_target(target_enu) is None else mavlink.RESULT_DENIED
+        return mav.RESULT_ACCEPTED if self._on_target(target_enu) is None else mav.RESULT_DENIED
 
     @property
     def _timeout_ns(self) -> int:
@@ -242,7 +239,7 @@ class VehicleSession:
         since_s = (now_ns - self._sequence_ns) / NS_PER_S
         if since_s >= self._config.engage.stream_s + self._config.engage.timeout_s:
             self._event(Event.ENGAGE_TIMEOUT)
-            self._status(mavlink.SEVERITY_WARNING, "engage: autopilot did not enter its external mode")
+            self._status(mav.SEVERITY_WARNING, "engage: autopilot did not enter its external mode")
         elif since_s >= self._config.engage.stream_s:
             self._request(self._profile.external, now_ns)
 
@@ -268,9 +265,9 @@ class VehicleSession:
         self._intervals_ns = now_ns
         rate_hz = float(self._config.rate_hz)
         for message, hz in (
-            (mavlink.MSG_LOCAL_POSITION_NED, rate_hz),
-            (mavlink.MSG_ATTITUDE_QUATERNION, rate_hz),
-            (mavlink.MSG_EXTENDED_SYS_STATE, EXTENDED_SYS_STATE_HZ),
+            (mav.MSG_LOCAL_POSITION_NED, rate_hz),
+            (mav.MSG_ATTITUDE_QUATERNION, rate_hz),
+            (mav.MSG_EXTENDED_SYS_STATE, EXTENDED_SYS_STATE_HZ),
         ):
             self._outgoing.append(self._codec.encode_set_message_interval(message, hz))
 
@@ -280,7 +277,7 @@ class VehicleSession:
         if now != self._told:
             self._told = now
             state, reason = now
-            self._status(_SEVERITY.get(state, mavlink.SEVERITY_INFO), f"companion {state.value}: {reason}")
+            self._status(_SEVERITY.get(state, mav.SEVERITY_INFO), f"companion {state.value}: {reason}")
 
     def _status(self, severity: int, text: str) -> None:
         self._outgoing.append(self._codec.encode_statustext(severity, text))

@@ -15,7 +15,7 @@ from msgspec import Meta, Struct
 
 from companion.errors import FrameRejected
 from companion.frames import enu_covariance_from_ned, enu_from_ned
-from companion.types import NS_PER_S, Detection, DetectionFrame, DetectionKind, FloatArray, frozen
+from companion.types import NS_PER_S, Detection, DetectionFrame, DetectionKind, FloatArray, VehicleState, frozen
 
 JSON = "application/json"
 MSGPACK = "application/msgpack"
@@ -317,3 +317,29 @@ def _covariance(at: str, values: list[float], ned: bool) -> FloatArray:
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > MAX_STD_M**2 or np.linalg.eigvalsh(matrix)[0] <= 0.0:
         raise FrameRejected("out_of_range", f"{at}.covariance: expected a finite positive definite 6x6 upper triangle")
     return frozen(enu_covariance_from_ned(matrix) if ned else matrix)
+
+
+def vehicle_from_payload(payload: VehicleStateIn) -> VehicleState:
+    """The vehicle's state in ENU.
+
+    Raises:
+        FrameRejected: a number that is not finite or out of range, an attitude that is no rotation.
+    """
+    check_point("position", payload.position)
+    if not all(math.isfinite(x) and abs(x) <= MAX_SPEED_M_S for x in payload.velocity):
+        raise FrameRejected("out_of_range", f"velocity: expected finite within +-{MAX_SPEED_M_S:g} m/s")
+    if payload.stamp_ns < 0:
+        raise FrameRejected("out_of_range", f"stamp_ns: expected at least 0, got {payload.stamp_ns}")
+    if payload.position_std is not None:
+        _within("position_std", payload.position_std, 0.0, MAX_STD_M, "m")
+    attitude = np.array(payload.attitude or (1.0, 0.0, 0.0, 0.0))
+    if not (np.isfinite(attitude).all() and 0.9 < float(np.linalg.norm(attitude)) < 1.1):
+        raise FrameRejected("out_of_range", "attitude: expected a unit quaternion (w, x, y, z)")
+    convert = enu_from_ned if payload.frame == "local_ned" else np.asarray
+    return VehicleState(
+        stamp_ns=payload.stamp_ns,
+        p_enu=frozen(convert(payload.position)),
+        v_enu=frozen(convert(payload.velocity)),
+        q_enu_from_flu=frozen(attitude / np.linalg.norm(attitude)),
+        p_std_m=payload.position_std or 0.0,
+    )

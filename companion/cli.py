@@ -1,0 +1,117 @@
+"""`companion`: run, demo, publish, schema. Exit status 0 done, 1 the thing failed, 2 wrong usage or configuration."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from companion import __version__
+from companion.errors import CompanionError, ConfigError
+
+_EPILOG = """\
+examples:
+  companion demo                              fly the simulated vehicle through crossing obstacles
+  companion run -c configs/default.toml       the daemon, beside an autopilot
+  companion publish --source radar --orbit    publish a synthetic obstacle
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="companion",
+        description="Keeps a drone clear of moving obstacles: reads MAVLink and Zenoh, streams safe accelerations.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"companion {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_run(commands)
+    from companion import demo, publish
+
+    demo.add_parser(commands)
+    publish.add_parser(commands)
+    schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")
+    schema.add_argument("key", nargs="?", help="one key suffix, such as companion/setpoint; all where left out")
+    schema.set_defaults(handler=_schema)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # small matrices: threads only add latency
+        os.environ.setdefault(name, "1")
+    arguments = build_parser().parse_args(argv)
+    try:
+        return int(arguments.handler(arguments))
+    except ConfigError as error:
+        print(f"companion: {error}", file=sys.stderr)
+        return 2
+    except CompanionError as error:
+        print(f"companion: {error}", file=sys.stderr)
+        return 1
+
+
+def _add_run(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    run = commands.add_parser(
+        "run",
+        help="run the daemon",
+        description="Run the daemon until SIGINT or SIGTERM.",
+        epilog="example:\n  companion run -c configs/default.toml --set mavlink.url=udpin://0.0.0.0:14541",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    run.add_argument("-c", "--config", type=Path, required=True, metavar="FILE", help="TOML configuration")
+    run.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="override a key (repeatable)"
+    )
+    run.add_argument("--json", action="store_true", help="print a summary as one JSON object on stdout at the end")
+    run.add_argument("-v", "--verbose", action="store_true", help="log at debug level")
+    run.set_defaults(handler=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from companion.clock import SystemClock
+    from companion.config import load_config
+    from companion.service import Service
+
+    config = load_config(arguments.config, tuple(arguments.overrides))
+    logging.basicConfig(
+        level=logging.DEBUG if arguments.verbose else logging.INFO,
+        stream=sys.stderr,
+        format="%(asctime)s %(levelname)s %(message)s",
+    )
+
+    async def serve() -> None:
+        service = Service(config, SystemClock())
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, service.stop)
+        summary = await service.run()
+        if arguments.json:
+            print(msgspec.json.encode(summary).decode(), flush=True)
+
+    asyncio.run(serve())
+    return 0
+
+
+def _schema(arguments: argparse.Namespace) -> int:
+    from companion.link.wire import json_schemas
+
+    schemas = json_schemas()
+    if arguments.key is not None and arguments.key not in schemas:
+        raise ConfigError(f"schema: {arguments.key}: expected one of {', '.join(sorted(schemas))}")
+    wanted = schemas if arguments.key is None else schemas[arguments.key]
+    print(msgspec.json.format(msgspec.json.encode(wanted), indent=2).decode())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

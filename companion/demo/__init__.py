@@ -1,0 +1,1 @@
+"""`companion demo`: the simulator and the daemon as separate processes, an operator on MAVSDK, a table, a picture."""

@@ -1,0 +1,107 @@
+"""The operator of the demo: MAVSDK on the simulator's ground station link, as a person with a ground station would.
+
+Never MAVSDK's Offboard plugin: it streams setpoints of its own beside the daemon's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from companion.errors import CompanionError
+
+CONNECT_S = 15.0
+HOVER_S = 30.0
+COMPANION_COMPONENT = 196
+_NAV_GUIDED_ENABLE = 92
+
+T = TypeVar("T")
+
+
+class OperatorError(CompanionError):
+    """A step of the operator that failed; the message names the step."""
+
+
+async def take_off_and_engage(gcs_port: int, on_step: Callable[[str], None]) -> None:
+    """Connect, wait for health, arm, take off, wait for the hover, engage the companion.
+
+    Raises:
+        OperatorError: a step was refused or timed out.
+    """
+    from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+
+    # MAVSDK blocks executor threads while it waits for acknowledgements
+    asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(max_workers=8))
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        on_step("connect")
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gcs_port}")
+        system = await mavsdk.first_autopilot(timeout_s=CONNECT_S)
+        if system is None:
+            raise OperatorError(f"operator: no autopilot on UDP port {gcs_port} within {CONNECT_S:g} s")
+        await _fly(system, on_step)
+
+
+async def _fly(system: Any, on_step: Callable[[str], None]) -> None:
+    from mavsdk.asyncio.plugins.action import ActionAsync
+    from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync
+    from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+    from mavsdk.plugins.action import ActionError
+    from mavsdk.plugins.telemetry import FlightMode
+
+    action, telemetry, direct = ActionAsync(system), TelemetryAsync(system), MavlinkDirectAsync(system)
+    step = "health"
+    try:
+        on_step(step)
+        await _until(telemetry.subscribe_health_all_ok(), lambda ok: bool(ok), step)
+        for step, call in (("arm", action.arm), ("takeoff", action.takeoff)):
+            on_step(step)
+            await call()
+        step = "hover"
+        on_step(step)
+        # airborne first: on the ground the mode is HOLD as well
+        await _until(telemetry.subscribe_in_air(), bool, step)
+        await _until(telemetry.subscribe_flight_mode(), lambda mode: mode == FlightMode.HOLD, step)
+        step = "engage"
+        on_step(step)
+        await engage(direct)
+    except ActionError as error:
+        raise OperatorError(f"operator: {step} refused: {error}") from None
+
+
+async def engage(direct: Any) -> None:
+    """MAV_CMD_NAV_GUIDED_ENABLE to component 196; a denial does not raise in MAVSDK, so its result is read."""
+    from mavsdk.plugins.mavlink_direct import MavlinkMessage
+
+    fields: dict[str, float] = {
+        "target_system": 1,
+        "target_component": COMPANION_COMPONENT,
+        "command": _NAV_GUIDED_ENABLE,
+    }
+    fields |= {"confirmation": 0, "param1": 1.0} | {f"param{i}": 0.0 for i in range(2, 8)}
+    command = MavlinkMessage(
+        message_name="COMMAND_LONG",
+        target_system_id=1,
+        target_component_id=COMPANION_COMPONENT,
+        fields_json=json.dumps(fields),
+    )
+    answer = await direct.send_command(command)
+    result = json.loads(answer.fields_json or "{}").get("result")
+    if result != 0:
+        raise OperatorError(f"operator: engage refused by the companion (MAV_RESULT {result})")
+
+
+async def _until(updates: AsyncIterator[T], accept: Callable[[T], bool], step: str) -> None:
+    """The first update that ``accept`` takes; the subscription is closed either way."""
+    async with contextlib.aclosing(updates) as stream:  # type: ignore[type-var]
+        try:
+            async with asyncio.timeout(HOVER_S):
+                async for update in stream:
+                    if accept(update):
+                        return
+        except TimeoutError:
+            raise OperatorError(f"operator: {step}: expected within {HOVER_S:g} s") from None

@@ -1,0 +1,99 @@
+"""What a tick and a status say to the outside: Zenoh, the log and its hash."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+import msgspec
+
+from companion.link import wire
+from companion.link.zenoh import ZenohLink
+from companion.metrics import TickMeter
+from companion.pilot import PilotOutput
+from companion.record import Recorder
+from companion.report import FlightHash, tracks_out, vehicle_out
+from companion.session import VehicleSession
+from companion.state import State
+from companion.types import NS_PER_S, DetectionFrame, Vec3, VehicleState
+
+log = logging.getLogger("companion")
+
+STATUS_NS = NS_PER_S // 5
+
+
+class Publisher:
+    """Publishes and logs; the record goes out first, because in lockstep the simulator waits for it."""
+
+    def __init__(self, zenoh: ZenohLink, recorder: Recorder | None) -> None:
+        self._zenoh = zenoh
+        self._recorder = recorder
+        self._hash = FlightHash()
+        self._verdict = "silent"
+        self._last: tuple[int, object] | None = None
+
+    @property
+    def log_hash(self) -> str:
+        return self._hash.hexdigest()
+
+    def tick(
+        self,
+        record: wire.SetpointRecord,
+        state: State,
+        vehicle: VehicleState,
+        frames: tuple[DetectionFrame, ...],
+        output: PilotOutput | None,
+    ) -> None:
+        """One tick's record, vehicle and tracks."""
+        self._verdict = record.verdict
+        self._zenoh.put("companion/setpoint", record)
+        payloads: dict[str, msgspec.Struct] = {"companion/setpoint": record}
+        if self._recorder is not None or self._zenoh.wanted("companion/vehicle"):
+            payloads["companion/vehicle"] = vehicle_out(vehicle)
+            self._zenoh.put("companion/vehicle", payloads["companion/vehicle"])
+        if output is not None and (self._recorder is not None or self._zenoh.wanted("companion/tracks")):
+            payloads["companion/tracks"] = tracks_out(output)
+            self._zenoh.put("companion/tracks", payloads["companion/tracks"])
+        self._hash.tick(state, vehicle, frames, output)
+        if self._recorder is not None:
+            self._recorder.frames(frames, vehicle.stamp_ns)
+            for key, payload in payloads.items():
+                self._recorder.message(f"/{key}", vehicle.stamp_ns, wire.encode(payload))
+
+    def status(
+        self,
+        now_ns: int,
+        vehicle_ns: int,
+        session: VehicleSession,
+        *,
+        target_enu: Vec3 | None,
+        tracks: int,
+        counts: Mapping[str, int],
+        meter: TickMeter,
+    ) -> None:
+        """The status, at 5 Hz and whenever the situation or the target changed."""
+        situation = session.situation
+        target = None if target_enu is None else tuple(target_enu.tolist())
+        key = (situation, target)
+        changed = self._last is None or self._last[1] != key
+        if not changed and self._last is not None and now_ns - self._last[0] < STATUS_NS:
+            return
+        self._last = (now_ns, key)
+        if changed:
+            log.info("%s (%s)", situation.state, situation.reason)
+        status = wire.Status(
+            state=situation.state.value,
+            reason=situation.reason,
+            vehicle_mode="unknown" if session.custom_mode is None else str(session.custom_mode),
+            engaged=situation.engaged,
+            armed=session.armed,
+            airborne=situation.airborne,
+            target=target,
+            tracks=tracks,
+            verdict=self._verdict,
+            counts=dict(counts),
+            tick_ms=meter.quantiles_ms(last=1000),
+        )
+        self._zenoh.put("companion/status", status)
+        if self._recorder is not None:
+            self._recorder.message("/companion/status", vehicle_ns, wire.encode(status))
