@@ -14,7 +14,7 @@ from sim_bridge.controller import (
     VelocitySetpoint,
 )
 from sim_bridge.crazyflie import Crazyflie
-from sim_bridge.physics import World
+from sim_bridge.physics import BodyState, World
 
 PHYSICS_HZ = 240
 
@@ -252,3 +252,17 @@ def test_reset_forgets_the_last_rate():
         fresh = Controller(world.vehicle, PHYSICS_HZ).rpm(world.state, setpoint)
         controller.reset()
         assert controller.rpm(world.state, setpoint) == fresh
+
+
+def test_torque_balances_the_gyroscopic_moment():
+    """At the wanted attitude, I omega' = tau - omega x I omega: the error's share is I k (0 - omega), the rest balances."""
+    vehicle = Crazyflie()
+    controller = Controller(vehicle, PHYSICS_HZ)
+    omega = (0.6, -0.5, 2.0)
+    state = BodyState((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), omega)
+    thrust, *torque = wrench(controller.rpm(state, AccelerationSetpoint((0.0, 0.0, 0.0))), vehicle)
+    inertia = np.diag(vehicle.inertia_kg_m2)
+    gains = np.array([controller.gains.rate_hz, controller.gains.rate_hz, controller.gains.yaw_rate_hz])
+    expected = inertia @ (-gains * omega) + np.cross(omega, inertia @ omega)
+    assert thrust == pytest.approx(vehicle.weight_n)
+    assert torque == pytest.approx(expected, rel=1e-9)
