@@ -255,7 +255,7 @@ def test_reset_forgets_the_last_rate():
 
 
 def test_torque_balances_the_gyroscopic_moment():
-    """At the wanted attitude, I omega' = tau - omega x I omega: the error's share is I k (0 - omega), the rest balances."""
+    """At the wanted attitude, I omega' = tau - omega x I omega: the error gives I k (0 - omega), the rest balances."""
     vehicle = Crazyflie()
     controller = Controller(vehicle, PHYSICS_HZ)
     omega = (0.6, -0.5, 2.0)
