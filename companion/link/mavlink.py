@@ -252,3 +252,12 @@ def _checked(name: str, values: Iterable[float], bound: float) -> list[float]:
     if not all(math.isfinite(value) and abs(value) <= bound for value in floats):
         raise SetpointRefused(f"{name}: expected finite numbers within +-{bound:g}, got {floats}")
     return floats
+
+
+def packet_count(data: bytes) -> int:
+    """How many unsigned MAVLink 2 packets ``data``, made by this codec, consists of."""
+    count = at = 0
+    while at < len(data):
+        at += 12 + data[at + 1]
+        count += 1
+    return count

@@ -6,7 +6,7 @@ Quality of service, and why:
   delay a tick, and the next record makes up for a lost one. In lockstep they are BLOCK: the simulator waits for each.
 - ``companion/status`` is DROP: it repeats at 5 Hz.
 - setpoint records are express (no batching) and above the rest in priority: they are what latency is measured by.
-- replies to queries leave with DROP congestion control: a questioner that does not read must not block the loop.
+- replies to queries take the quality of service of their query.
 
 Callbacks run on a thread of Zenoh's: they copy, wake the loop and return. At most 4096 messages wait for the loop,
 the oldest are dropped and counted.
@@ -222,7 +222,7 @@ class ZenohLink:
         def reply(query: zenoh.Query, payload: bytes, encoding: str) -> None:
             data = answer(payload, encoding)
             with query:  # leaving it tells the questioner that no more replies follow
-                query.reply(name, data, encoding=wire.JSON, congestion_control=zenoh.CongestionControl.DROP)
+                query.reply(name, data, encoding=wire.JSON)
 
         def received(query: zenoh.Query) -> None:
             body = query.payload
