@@ -125,10 +125,10 @@ class MavlinkCodec:
             mav.FRAME_LOCAL_NED,
             type_mask,
             *(0.0, 0.0, 0.0),
-            *(vy, vx, -vz),
-            *(ay, ax, -az),
+            *(vy, vx, 0.0 - vz),  # no negative zeros on the wire
+            *(ay, ax, 0.0 - az),
             0.0,
-            -rate,
+            0.0 - rate,
         )
         return self._pack(message)
 
