@@ -31,6 +31,7 @@ from companion.tracking.models import (
     P,
     build_models,
     propagate,
+    shared,
     to_common,
 )
 from companion.types import FloatArray
@@ -132,7 +133,7 @@ def birth(z: FloatArray, noise: FloatArray, constants: Constants) -> Bank:
 
 def markov(dt: FloatArray, constants: Constants) -> FloatArray:
     """Pi(dt) = exp(G dt), G the generator of the symmetric per-step matrix: 1/3 + (I - 1/3) persistence^(dt / dt_s)."""
-    decay = constants.persistence ** (np.maximum(dt, 0.0) / constants.dt_s)
+    decay = constants.persistence ** (shared(dt) / constants.dt_s)
     return np.asarray((1.0 - decay[:, None, None]) / MODELS + decay[:, None, None] * _EYE)
 
 
@@ -179,20 +180,21 @@ def correct(
     nis = (innovation * weighted[..., 0]).sum(axis=-1)
     gain = to_measurement @ inverse
     updated = x + (to_measurement @ weighted)[..., 0]
-    spread = covariance - gain @ covariance[..., :d, :]
-    spread = 0.5 * (spread + spread.swapaxes(2, 3))
-    return updated, spread, -0.5 * (nis + log_determinant + d * _LOG_2PI), nis
+    spread: FloatArray = covariance - gain @ covariance[..., :d, :]
+    log_likelihood: FloatArray = -0.5 * (nis + log_determinant + d * _LOG_2PI)
+    return updated, 0.5 * (spread + spread.swapaxes(2, 3)), log_likelihood, nis
 
 
 def _invert(s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Inverse and log-determinant of symmetric positive definite (..., d, d); d = 3 by cofactors."""
     if s.shape[-1] != 3:
-        return np.linalg.inv(s), np.asarray(np.linalg.slogdet(s)[1])
+        return np.asarray(np.linalg.inv(s), dtype=np.float64), np.asarray(np.linalg.slogdet(s)[1])
     flat = np.ascontiguousarray(s).reshape(*s.shape[:-2], 9)
     f1, f2, f3, f4 = _COFACTOR
     cofactor = flat.take(f1, axis=-1) * flat.take(f2, axis=-1) - flat.take(f3, axis=-1) * flat.take(f4, axis=-1)
     determinant = (flat[..., :3] * cofactor[..., :3]).sum(axis=-1)
-    return np.asarray((cofactor / determinant[..., None]).reshape(s.shape)), np.log(determinant)
+    inverse: FloatArray = (cofactor / determinant[..., None]).reshape(s.shape)
+    return inverse, np.log(determinant)
 
 
 def step(

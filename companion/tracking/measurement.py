@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from companion.types import Detection, FloatArray
 # A sensor that claims a perfect fix would take the last digit out of the filter; one that claims 100 m says nothing.
 VARIANCE_MIN = 1e-6  # [m^2], [m^2/s^2]
 VARIANCE_MAX = 1e4
+_NO_VELOCITY = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +39,12 @@ class Measurements:
 
 def is_finite(detection: Detection) -> bool:
     """Whether every number of ``detection`` is finite; the wire checks this too, a library user may not."""
-    parts = [detection.radius_m, detection.p_std_m or 0.0, detection.v_std_m_s or 0.0]
-    arrays = (detection.p_enu, detection.v_enu, detection.covariance)
-    return bool(np.isfinite(parts).all()) and all(bool(np.isfinite(a).all()) for a in arrays if a is not None)
+    numbers = [*detection.p_enu.tolist(), detection.radius_m, detection.p_std_m or 0.0, detection.v_std_m_s or 0.0]
+    if detection.v_enu is not None:
+        numbers += detection.v_enu.tolist()
+    if detection.covariance is not None:
+        numbers += detection.covariance.ravel().tolist()
+    return all(map(math.isfinite, numbers))
 
 
 def measure(detections: Sequence[Detection], config: TrackingConfig) -> Measurements:
@@ -48,25 +53,25 @@ def measure(detections: Sequence[Detection], config: TrackingConfig) -> Measurem
     Variances (eigenvalues, for a covariance) are held within 1e-6 and 1e4, so R is always positive definite. With
     ``force_measurement_variance`` only the position counts, at the configured variance (Remark 1).
     """
+    stated = not config.force_measurement_variance
+    default_m2, default_m2_s2 = config.measurement_variance_m2, config.velocity_std_m_s**2
+    z, diagonal = [], []
+    for detection in detections:
+        v = detection.v_enu if stated else None
+        z.append([*detection.p_enu.tolist(), *(_NO_VELOCITY if v is None else v.tolist())])
+        p_m2 = detection.p_std_m**2 if stated and detection.p_std_m is not None else default_m2
+        v_m2_s2 = detection.v_std_m_s**2 if detection.v_std_m_s is not None else default_m2_s2
+        diagonal.append([p_m2, p_m2, p_m2, v_m2_s2, v_m2_s2, v_m2_s2])
     count = len(detections)
-    z, noise = np.zeros((count, 6)), np.zeros((count, 6, 6))
-    full = np.zeros(count, dtype=np.bool_)
-    diagonal = np.empty((count, 6))
+    noise = np.zeros((count, 6, 6))
+    noise.reshape(count, 36)[:, ::7] = np.minimum(
+        np.maximum(np.array(diagonal).reshape(count, 6), VARIANCE_MIN), VARIANCE_MAX
+    )
     for row, detection in enumerate(detections):
-        z[row, :3] = detection.p_enu
-        if detection.p_std_m is None or config.force_measurement_variance:
-            diagonal[row, :3] = config.measurement_variance_m2
-        else:
-            diagonal[row, :3] = detection.p_std_m**2
-        diagonal[row, 3:] = (config.velocity_std_m_s if detection.v_std_m_s is None else detection.v_std_m_s) ** 2
-        if detection.v_enu is not None and not config.force_measurement_variance:
-            z[row, 3:] = detection.v_enu
-            full[row] = True
-    noise.reshape(count, 36)[:, ::7] = np.minimum(np.maximum(diagonal, VARIANCE_MIN), VARIANCE_MAX)
-    for row, detection in enumerate(detections):
-        if detection.covariance is not None and not config.force_measurement_variance:
-            noise[row] = _bounded(np.asarray(detection.covariance, dtype=np.float64))
-    return Measurements(z, noise, full, np.array([d.radius_m for d in detections]))
+        if detection.covariance is not None and stated:
+            noise[row] = _bounded(detection.covariance)
+    full = np.array([stated and d.v_enu is not None for d in detections], dtype=np.bool_)
+    return Measurements(np.array(z).reshape(count, 6), noise, full, np.array([d.radius_m for d in detections]))
 
 
 def _bounded(covariance: FloatArray) -> FloatArray:

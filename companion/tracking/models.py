@@ -115,16 +115,18 @@ def turn_terms(turn: FloatArray, dt: FloatArray) -> tuple[ComplexArray, ComplexA
     """
     angle = turn * dt
     rotation = np.exp(1j * angle)
-    magnitude = np.abs(angle)
-    if not magnitude.size or magnitude.min() >= _SERIES_BELOW_RAD:
+    small = np.abs(angle) < _SERIES_BELOW_RAD
+    if not small.any():
         integral = (rotation - 1.0) / (1j * turn)
         return rotation, integral, (dt * rotation - integral) / turn
-    small = magnitude < _SERIES_BELOW_RAD
     safe = np.where(small, 1.0, turn)
-    j = 1j * angle
-    integral = np.where(small, dt * (1.0 + j / 2.0 * (1.0 + j / 3.0 * (1.0 + j / 4.0))), (rotation - 1.0) / (1j * safe))
-    series = 1j * dt * dt * (0.5 + j * (1.0 / 3.0 + j * (0.125 + j / 30.0)))
-    return rotation, integral, np.where(small, series, (dt * rotation - integral) / safe)
+    integral = (rotation - 1.0) / (1j * safe)
+    slope = (dt * rotation - integral) / safe
+    j = 1j * angle[small]
+    duration = np.broadcast_to(dt, angle.shape)[small]
+    integral[small] = duration * (1.0 + j / 2.0 * (1.0 + j / 3.0 * (1.0 + j / 4.0)))
+    slope[small] = 1j * duration * duration * (0.5 + j * (1.0 / 3.0 + j * (0.125 + j / 30.0)))
+    return rotation, integral, slope
 
 
 def propagate(
@@ -139,7 +141,7 @@ def propagate(
     """
     count = x.shape[0]
     both = np.empty((count, 2, MODELS, SIZE, SIZE))
-    both.reshape(count, 2 * _FLAT)[:] = _powers(dt) @ models.polynomials
+    both.reshape(count, 2 * _FLAT)[:] = (shared(dt)[:, None] ** _EXPONENTS) @ models.polynomials
     jacobian, noise = both[:, 0], both[:, 1]
     rotation, integral, slope = turn_terms(x[:, CT, TURN], dt)
     horizontal = jacobian[:, CT, :6].reshape(count, 2, 3, SIZE)[:, :, :2]  # rows p_x, p_y and v_x, v_y
@@ -159,12 +161,10 @@ def propagate(
     return moved, spread
 
 
-def _powers(dt: FloatArray) -> FloatArray:
-    """dt^0 .. dt^5, (M, 6), or (1, 6) where all tracks share one dt, as they do in a frame of one source."""
+def shared(dt: FloatArray) -> FloatArray:
+    """``dt`` (M,), or its one value (1,) where all tracks share it, as they do in a frame of one source."""
     values = dt.tolist()
-    if values and values.count(values[0]) == len(values):
-        dt = dt[:1]
-    return np.asarray(dt[:, None] ** _EXPONENTS)
+    return dt[:1] if values and values.count(values[0]) == len(values) else dt
 
 
 def horizontal_velocity(x: FloatArray) -> ComplexArray:

@@ -11,11 +11,43 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.tracking.models import CT, MODELS, TURN, A, MotionModels, P, V, turn_terms
+from companion.tracking.models import CT, MODELS, SIZE, TURN, MotionModels, horizontal_velocity, turn_terms
 from companion.types import FloatArray
 
-_CT_PARTS = np.array([0, 1, 2, 3, 4, 5, TURN])
 _DIAGONAL = slice(0, 9, 4)  # of a flattened 3x3
+
+
+def _polynomial_map() -> FloatArray:
+    """(100, 45): a covariance over [p, v, a] -> the coefficients of tau^0 .. tau^4 of P(tau), each 3x3.
+
+    With f = (1, tau, tau^2 / 2) the position's covariance is sum_ij f_i f_j P_ij over the 3x3 blocks.
+    """
+    scale = (1.0, 1.0, 0.5)
+    out = np.zeros((SIZE, SIZE, 5, 3, 3))
+    for i in range(3):
+        for j in range(3):
+            for row in range(3):
+                for column in range(3):
+                    out[3 * i + row, 3 * j + column, i + j, row, column] += scale[i] * scale[j]
+    return out.reshape(SIZE * SIZE, 45)
+
+
+def _complex_map() -> FloatArray:
+    """(100, 48): a covariance -> second moments of u = (p_x + i p_y, v_x + i v_y, Omega), as (3, 8) complex.
+
+    Columns: E[u u^H] (3), E[u u^T] (3), E[u z], E[u v_z].
+    """
+    u = np.zeros((3, SIZE), dtype=np.complex128)
+    u[0, 0], u[0, 1] = 1.0, 1j
+    u[1, 3], u[1, 4] = 1.0, 1j
+    u[2, TURN] = 1.0
+    right = np.hstack((u.conj().T, u.T, np.eye(SIZE)[:, [2, 5]]))  # (10, 8)
+    out = u.T[:, None, :, None] * right[None, :, None, :]  # (10, 10, 3, 8)
+    return np.ascontiguousarray(out).reshape(SIZE * SIZE, 24).view(np.float64)
+
+
+_POLYNOMIAL_MAP = _polynomial_map()
+_COMPLEX_MAP = _complex_map()
 
 
 def predict_positions(
@@ -32,9 +64,11 @@ def predict_positions(
     powers = tau_s[:, None] ** np.arange(6.0)  # (K, 6)
     p = np.empty((tracks, MODELS, steps, 3))
     spread = np.empty((tracks, MODELS, steps, 9))
-    p[:, :CT], spread[:, :CT] = _straight(x[:, :CT], covariance[:, :CT], powers)
-    p[:, CT], spread[:, CT] = _turning(x[:, CT], covariance[:, CT], tau_s, models.turn_psd)
-    spread[..., _DIAGONAL] += (models.prediction_noise @ powers.T)[None, :, :, None]
+    np.matmul(powers[:, :3] * (1.0, 1.0, 0.5), x[:, :CT, :9].reshape(tracks, CT, 3, 3), out=p[:, :CT])
+    terms = covariance[:, :CT].reshape(tracks, CT, SIZE * SIZE) @ _POLYNOMIAL_MAP
+    np.matmul(powers[:, :5], terms.reshape(tracks, CT, 5, 9), out=spread[:, :CT])
+    _turning(x, covariance, tau_s, models.turn_psd, p[:, CT], spread[:, CT])
+    spread[..., _DIAGONAL] += (models.prediction_noise @ powers.T)[:, :, None]
     weights = probabilities[:, None, :]
     fused = (weights @ p.reshape(tracks, MODELS, steps * 3)).reshape(tracks, steps, 3)
     offset = p - fused[:, None]
@@ -43,45 +77,40 @@ def predict_positions(
     return fused, total
 
 
-def _straight(x: FloatArray, covariance: FloatArray, powers: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """CV and CA: p + v tau + a tau^2 / 2 and its covariance, noise left out; (M, 2, K, 3) and (M, 2, K, 9)."""
-    shape = (*x.shape[:2], 3, 3)
-    p = powers[:, :3] * (1.0, 1.0, 0.5) @ x[..., :9].reshape(shape)
-    pv, pa, va = covariance[..., P, V], covariance[..., P, A], covariance[..., V, A]
-    terms = np.empty((*x.shape[:2], 5, 3, 3))
-    terms[:, :, 0] = covariance[..., P, P]
-    terms[:, :, 1] = pv + pv.swapaxes(2, 3)
-    terms[:, :, 2] = covariance[..., V, V] + 0.5 * (pa + pa.swapaxes(2, 3))
-    terms[:, :, 3] = 0.5 * (va + va.swapaxes(2, 3))
-    terms[:, :, 4] = 0.25 * covariance[..., A, A]
-    return p, powers[:, :5] @ terms.reshape(*x.shape[:2], 5, 9)
-
-
 def _turning(
-    x: FloatArray, covariance: FloatArray, tau_s: FloatArray, turn_psd: float
-) -> tuple[FloatArray, FloatArray]:
-    """CT: positions and covariances, only the turn rate's noise included; (M, K, 3) and (M, K, 9)."""
+    x: FloatArray, covariance: FloatArray, tau_s: FloatArray, turn_psd: float, p: FloatArray, spread: FloatArray
+) -> None:
+    """CT's positions (M, K, 3) and covariances (M, K, 9), written into ``p`` and ``spread``; isotropic noise left out.
+
+    In the complex horizontal plane an error moves as dp(tau) = dp + I dv + (dI/dOmega) w dOmega = f^T u. Its variance
+    E|dp|^2 and pseudo-variance E[dp^2] hold the three entries of the horizontal block.
+    """
     tracks, steps = x.shape[0], tau_s.shape[0]
-    _, integral, slope = turn_terms(x[:, TURN, None], tau_s)
-    w = (x[:, 3] + 1j * x[:, 4])[:, None]
-    move, column = integral * w, slope * w
-    p = np.empty((tracks, steps, 3))
-    p[..., 0] = x[:, 0, None] + move.real
-    p[..., 1] = x[:, 1, None] + move.imag
-    p[..., 2] = x[:, 2, None] + x[:, 5, None] * tau_s
-    jacobian = np.zeros((tracks, steps, 3, 7))
-    jacobian[..., 0, 0] = jacobian[..., 1, 1] = jacobian[..., 2, 2] = 1.0
-    jacobian[..., 0, 3] = jacobian[..., 1, 4] = integral.real
-    jacobian[..., 1, 3] = integral.imag
-    jacobian[..., 0, 4] = -integral.imag
-    jacobian[..., 2, 5] = tau_s
-    jacobian[..., 0, 6] = column.real
-    jacobian[..., 1, 6] = column.imag
-    part = covariance[:, _CT_PARTS[:, None], _CT_PARTS]
-    # the turn rate's own wandering is one more variance on the same column: q tau / 5 (see `turn_noise`)
-    left = (jacobian.reshape(tracks, steps * 3, 7) @ part).reshape(jacobian.shape)
-    left[..., 6] += (0.2 * turn_psd * tau_s)[:, None] * jacobian[..., 6]
-    return p, (left @ jacobian.swapaxes(2, 3)).reshape(tracks, steps, 9)
+    _, integral, slope = turn_terms(x[:, CT, TURN, None], tau_s)
+    w = horizontal_velocity(x)[:, None]
+    move = integral * w
+    p[..., 0] = move.real + x[:, CT, 0, None]
+    p[..., 1] = move.imag + x[:, CT, 1, None]
+    p[..., 2] = x[:, CT, 5, None] * tau_s + x[:, CT, 2, None]
+    f = np.empty((tracks, steps, 3), dtype=np.complex128)
+    f[..., 0] = 1.0
+    f[..., 1] = integral
+    column = f[..., 2] = slope * w
+    ct = covariance[:, CT]
+    moments = (ct.reshape(tracks, SIZE * SIZE) @ _COMPLEX_MAP).view(np.complex128).reshape(tracks, 3, 8)
+    carried = f @ moments  # (M, K, 8)
+    # the turn rate's own wandering is one more variance on its column: q tau / 5 (see `turn_noise`)
+    carried[..., 2] += column * (0.2 * turn_psd * tau_s)
+    carried[..., 5] += column * (0.2 * turn_psd * tau_s)
+    variance = (carried[..., :3] * f.conj()).sum(axis=-1).real
+    pseudo = (carried[..., 3:6] * f).sum(axis=-1)
+    cross = carried[..., 6] + carried[..., 7] * tau_s
+    spread[..., 0] = 0.5 * (variance + pseudo.real)
+    spread[..., 4] = 0.5 * (variance - pseudo.real)
+    spread[..., 1] = spread[..., 3] = 0.5 * pseudo.imag
+    spread[..., 2] = spread[..., 6] = cross.real
+    spread[..., 5] = spread[..., 7] = cross.imag
+    spread[..., 8] = ct[:, 2, 2, None] + (2.0 * ct[:, 2, 5, None] + ct[:, 5, 5, None] * tau_s) * tau_s
 
 
 def largest_sigma(covariance: FloatArray) -> FloatArray:
@@ -90,13 +119,12 @@ def largest_sigma(covariance: FloatArray) -> FloatArray:
     With q = tr / 3, s^2 = tr((C - q I)^2) / 6 and r = det((C - q I) / s) / 2 the largest eigenvalue is
     q + 2 s cos(arccos(r) / 3). Source: Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961.
     """
-    c = covariance.reshape(*covariance.shape[:-2], 9)
-    mean = c[..., _DIAGONAL].sum(axis=-1) / 3.0
-    a, b, d = (c[..., k] - mean for k in (0, 4, 8))
-    xy, xz, yz = c[..., 1], c[..., 2], c[..., 5]
+    xx, xy, xz, _, yy, yz, _, _, zz = np.moveaxis(covariance.reshape(*covariance.shape[:-2], 9), -1, 0)
+    mean = (xx + yy + zz) / 3.0
+    a, b, d = xx - mean, yy - mean, zz - mean
     xy2, xz2, yz2 = xy * xy, xz * xz, yz * yz
-    scale = np.sqrt((a * a + b * b + d * d + 2.0 * (xy2 + xz2 + yz2)) / 6.0)
+    scale = np.sqrt((a * a + b * b + d * d) / 6.0 + (xy2 + xz2 + yz2) / 3.0)
     determinant = a * (b * d - yz2) - d * xy2 - b * xz2 + 2.0 * xy * xz * yz
-    cube = 2.0 * scale * scale * scale
-    ratio = np.minimum(np.maximum(determinant / np.maximum(cube, np.finfo(np.float64).tiny), -1.0), 1.0)
+    cube = np.maximum(2.0 * scale * scale * scale, np.finfo(np.float64).tiny)
+    ratio = np.minimum(np.maximum(determinant / cube, -1.0), 1.0)
     return np.asarray(np.sqrt(np.maximum(mean + 2.0 * scale * np.cos(np.arccos(ratio) / 3.0), 0.0)))
