@@ -35,7 +35,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
-    from companion import demo, publish
+    from companion import publish
+    from companion.demo import command as demo
 
     demo.add_parser(commands)
     publish.add_parser(commands)

@@ -19,7 +19,7 @@ from companion.errors import CompanionError, LockstepStalled
 from companion.link import mav
 from companion.link.events import TimesyncReply, TimesyncRequest
 from companion.link.inbox import ObstacleInbox
-from companion.link.mavlink import MavlinkCodec
+from companion.link.mavlink import MavlinkCodec, packet_count
 from companion.link.timesync import TimeSync
 from companion.link.transports import Transport, open_transport
 from companion.link.zenoh import ZenohLink
@@ -269,11 +269,11 @@ class Service:
         self._publish_status(now_ns)
 
     def _flush(self) -> int:
-        """Send what the session has to say; the number of messages."""
+        """Send what the session has to say; the number of MAVLink packets."""
         outgoing = self._session.take_outgoing()
         for data in outgoing:
             self._transport.send(data)
-        return len(outgoing)
+        return sum(packet_count(data) for data in outgoing)
 
     def _publish_status(self, now_ns: int) -> None:
         self._publisher.status(
