@@ -51,7 +51,7 @@ PROFILES: dict[str, Profile] = {
             type_mask=MASK_ACCELERATION,
             external=_PX4_OFFBOARD,
             hold=_PX4_HOLD,
-            actuation_lag_s=0.10,
+            actuation_lag_s=0.08,
             streams_when_ready=True,
             engage_by="command",
         ),

@@ -7,6 +7,7 @@ the monotonic clock otherwise; only differences of it are used.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from companion.config import Config
 from companion.link import mav
@@ -131,6 +132,8 @@ class VehicleSession:
         fresh = self._is_fresh(now_ns)
         if fresh != self.situation.fresh:
             self._event(Event.VEHICLE_FRESH if fresh else Event.VEHICLE_LOST, self._lost_reason(now_ns))
+        elif self.situation.state is State.WAITING:
+            self.situation = replace(self.situation, reason=self._lost_reason(now_ns))
         self._run_sequence(now_ns)
         self._run_requests(now_ns)
         self._ask_intervals(now_ns)
@@ -218,15 +221,14 @@ class VehicleSession:
         return now_ns - self._heartbeat_ns <= self._timeout_ns and now_ns - self._state_ns <= stale_ns
 
     def _lost_reason(self, now_ns: int) -> str:
+        """Why there is no fresh vehicle; without numbers that change, so that it is told once."""
+        if self._system is None and len(self._candidates) > 1:
+            return f"autopilots {sorted(self._candidates)} heard, set mavlink.system_id"
         if self._heartbeat_ns is None:
             return "no heartbeat"
         if now_ns - self._heartbeat_ns > self._timeout_ns:
-            return f"no heartbeat for {(now_ns - self._heartbeat_ns) / 1e9:.1f} s"
-        if self._state_ns is None:
-            return "no vehicle state"
-        age_s = (now_ns - self._state_ns) / 1e9
-        stale = age_s > self._config.vehicle.stale_s
-        return f"no vehicle state for {age_s:.1f} s" if stale else "vehicle state fresh"
+            return "heartbeat lost"
+        return "no vehicle state" if not self._is_fresh(now_ns) else "vehicle fresh"
 
     def _run_sequence(self, now_ns: int) -> None:
         """Engaged but not in the external mode: stream for a while, then ask for it, then give up."""
