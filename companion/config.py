@@ -115,11 +115,13 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     epsilon_max: Positive = 2.0
     eta: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.5
     lambda_u: Positive = 1.0
-    lambda_epsilon: Positive = 10.0
-    lambda_delta: Positive = 1e4
+    lambda_epsilon: Positive = 0.01
+    lambda_delta: Positive = 0.01
     drone_radius_m: Positive = 0.2
     cushion_m: NonNegative = 0.1
     kappa: NonNegative = 2.0
+    sigma_growth_s: NonNegative = 5.0  # predicted sigma is counted up to this far ahead, later rows keep that value
+    sigma_cap_m: Positive = 10.0  # and kappa sigma no further than this: a track just born is no wall
     sigma_delay_s: NonNegative = 0.01
     solver: Literal["daqp", "osqp"] = "daqp"
     iterations: Annotated[int, Meta(ge=1, le=50)] = 6
@@ -190,7 +192,14 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "safety": {
-        "paper": {"form": "paper", "horizon": 5, "kappa": 0.0, "sigma_delay_s": 0.0},
+        "paper": {
+            "form": "paper",
+            "horizon": 5,
+            "kappa": 0.0,
+            "sigma_delay_s": 0.0,
+            "lambda_epsilon": 10.0,
+            "lambda_delta": 1e4,
+        },
     },
     "tracking": {
         # Remark 1; 0.6 on the diagonal, 0.2 elsewhere

@@ -114,6 +114,7 @@ class Barrier:
         steps = np.arange(config.horizon + 3)
         self._time_s = steps * config.dt_s
         self._reach: FloatArray = np.asarray(config.dt_s**2 * steps * (steps - 1) / 2.0, dtype=np.float64)
+        self._sigma_at = np.minimum(steps[2:], round(config.sigma_growth_s / config.dt_s))
         self._letter = math.sqrt(2.0) if config.form == "paper" else 1.0
 
     def rows(self, p_enu: Vec3, v_enu: Vec3, prediction: Prediction, p_std_m: float) -> BarrierRows:
@@ -136,7 +137,8 @@ class Barrier:
         half_square[..., 1:4] = self._reach[:, None] * drift
         half_square[..., 4] = self._reach**2
         decayed = half_square[:, 1:] - (1.0 - config.alpha1) * half_square[:, :-1]  # psi without its D
-        sigma = config.kappa * np.sqrt(prediction.sigma_m[:, 2:instants] ** 2 + p_std_m**2)
+        sigma = config.kappa * np.sqrt(prediction.sigma_m[:, self._sigma_at] ** 2 + p_std_m**2)
+        sigma = np.minimum(sigma, config.sigma_cap_m)
         relative = prediction.v_enu - v_enu
         delay = config.sigma_delay_s * np.sqrt((relative * relative).sum(axis=-1))
         radii = prediction.radius_m + config.drone_radius_m

@@ -37,6 +37,7 @@ RING_POINTS = 8
 SETTLED_M_S2 = 1e-3  # iterates closer than this have converged: the answer is admissible either way
 INSET_M_S2 = 1e-7  # tangents are kept by this much, so that the solver's tolerance stays inside the rows
 SHARE_WEIGHT = 1e4  # cost of the whole margin, against |a - a_ref|^2 in (m/s^2)^2
+_STEPS = np.array([[1.0], [0.5], [0.25], [0.1]])  # shares of a program's step that are judged
 _LATTICE = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0, -1, 1)], dtype=np.float64)
 
 
@@ -140,11 +141,14 @@ def least_cost(task: Task, start: Found, order: tuple[str, ...]) -> Found:
             x, solver = solve(_tangent_program(task, a, epsilon), order)
         except Infeasible:
             break
-        previous, a = a, task.limits.clip(x[:3])
-        verdict = judge(task, a[None])
-        epsilon = np.minimum(np.maximum(x[3 : 3 + len(task.rows)], verdict.lower[0]), verdict.upper[0])
-        if verdict.admissible[0] and verdict.cost[0] < best.cost:
-            best = Found(a, epsilon, True, float(verdict.cost[0]), count, solver)
+        previous = a
+        tried = task.limits.clip(a + _STEPS * (x[:3] - a))
+        verdict = judge(task, tried)
+        taken = int(np.where(verdict.admissible, verdict.cost, np.inf).argmin())
+        a = tried[taken]
+        epsilon = np.minimum(np.maximum(task.star, verdict.lower[taken]), verdict.upper[taken])
+        if verdict.admissible[taken] and verdict.cost[taken] < best.cost:
+            best = Found(a, epsilon, True, float(verdict.cost[taken]), count, solver)
         if best.admissible and float(np.abs(a - previous).max()) < SETTLED_M_S2:
             break
     return best
@@ -235,10 +239,10 @@ def _share_program(task: Task, a: Vec3, low: Vec3, high: Vec3) -> Program:
     normal = r * (reach[:, None] / distance[..., None])
     floor = (normal @ a) - distance + rows.radii_m[:, None]
     tangents = np.zeros((floor.size + 1, 5))
-    tangents[:-1, :3] = (normal / reach[:, None]).reshape(-1, 3)
-    tangents[:-1, 3] = (-_margins(rows) / reach).reshape(-1)
+    tangents[:-1, :3] = normal.reshape(-1, 3)
+    tangents[:-1, 3] = -_margins(rows).reshape(-1)
     floors = np.empty(len(tangents))
-    floors[:-1] = (floor / reach).reshape(-1)
+    floors[:-1] = floor.reshape(-1)
     tangents[-1, :3], floors[-1] = task.limits.speed_row(a)
     tangents[-1, 4] = 1.0
     return Program(

@@ -1,0 +1,316 @@
+"""Closed-loop encounters: the unmodified tracker and filter on a point mass, against obstacles timed to hit it.
+
+The vehicle follows its acceleration setpoint with a first-order lag; obstacles (linear, accelerating, figure eight)
+are placed so that they meet the undisturbed flight, and an encounter counts only if the unfiltered vehicle is hit.
+Clearance is surface to surface, taken at every substep. Flight time is compared with the same flight without
+obstacles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from companion.config import Config
+from companion.safety.filter import FilterInput, SafetyFilter
+from companion.tracking.tracker import Tracker
+from companion.types import (
+    NS_PER_S,
+    Detection,
+    DetectionFrame,
+    DetectionKind,
+    FilterResult,
+    FloatArray,
+    Vec3,
+    Verdict,
+    frozen,
+)
+
+TICK_S = 0.05
+SUBSTEPS = 10
+LAG_S = 0.1
+REACHED_M = 0.3
+DWELL_S = 1.0  # the target counts as reached where the vehicle then stays within REACHED_M for this long
+TIME_OUT_S = 30.0
+WARM_UP_S = 1.0  # the sensor runs this long before the flight, as it does while a vehicle takes off
+MOTIONS = ("linear", "accelerating", "eight")
+
+Reference = Callable[[Vec3, Vec3], Vec3]  # (v_enu, e_enu) -> net acceleration [m/s^2]
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle:
+    """One sphere. At ``crossing_s`` it is at ``p_enu`` with velocity ``v_enu``."""
+
+    motion: str
+    crossing_s: float
+    p_enu: Vec3  # [m]
+    v_enu: Vec3  # [m/s]
+    bend_enu: Vec3  # accelerating: acceleration [m/s^2]; eight: unit vector across v_enu
+    rate_rad_s: float = 0.0  # eight only
+    radius_m: float = 0.2
+
+    def position(self, t_s: FloatArray) -> FloatArray:
+        """Centre at ``t_s`` (...,), ENU (..., 3) [m]. An eight is A (sin wt, sin 2wt) about its own centre."""
+        t = np.asarray(t_s)[..., None] - self.crossing_s
+        if self.motion == "linear":
+            return self.p_enu + self.v_enu * t
+        if self.motion == "accelerating":
+            return self.p_enu + self.v_enu * t + 0.5 * self.bend_enu * t * t
+        w = self.rate_rad_s
+        speed = float(np.linalg.norm(self.v_enu))
+        along = self.v_enu / speed
+        size = speed / (math.sqrt(2.0) * w)  # both parts start with the same speed: the path crosses at 45 degrees
+        one, two = (along + self.bend_enu) / math.sqrt(2.0), (along - self.bend_enu) / math.sqrt(2.0)
+        return self.p_enu + size * (one * np.sin(w * t) + two * 0.5 * np.sin(2.0 * w * t))
+
+
+@dataclass(frozen=True, slots=True)
+class Encounter:
+    """Where to fly, and what is in the way."""
+
+    seed: int
+    start_enu: Vec3
+    target_enu: Vec3
+    obstacles: tuple[Obstacle, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """An external sensor of all obstacles at the tick rate."""
+
+    noise_std_m: float = 0.05
+    latency_s: float = 0.05
+    dropout: float = 0.0
+
+    @property
+    def stated_std_m(self) -> float:
+        return max(self.noise_std_m, 0.01)
+
+
+@dataclass(slots=True)
+class Flight:
+    """What one flight came to. ``time_s`` None: the target was not reached."""
+
+    time_s: float | None = None
+    clearance_m: float = math.inf
+    verdicts: Counter[str] = field(default_factory=Counter)
+    reversals: int = 0  # ticks at which the correction turned by more than 90 degrees
+    path: list[Vec3] = field(default_factory=list)
+
+
+def stand_in_reference(limit_m_s2: float, speed_m_s: float) -> Reference:
+    """A nearly time-optimal reference: the speed from which 0.6 of the limit still stops, chased at 3 / s."""
+    braking = 0.6 * limit_m_s2
+
+    def act(v_enu: Vec3, e_enu: Vec3) -> Vec3:
+        distance = math.dist((0.0, 0.0, 0.0), e_enu)
+        direction = e_enu / max(distance, 1e-9)
+        profile = math.sqrt(2.0 * braking * distance)
+        speed = min(speed_m_s, profile, 1.5 * distance)
+        closing = float(direction @ v_enu)
+        a = 3.0 * (speed * direction - v_enu)
+        if speed == profile and closing > 0.7 * profile:  # on the braking parabola: its deceleration fed forward
+            a = a - braking * direction
+        return np.asarray(a * min(1.0, limit_m_s2 / max(float(np.abs(a).max()), 1e-9)))
+
+    return act
+
+
+class _Loop:
+    """Tracker, delay compensation and filter around a point mass, one tick at a time."""
+
+    def __init__(self, config: Config, reference: Reference, encounter: Encounter, sensor: Sensor) -> None:
+        self._config, self._reference, self._encounter, self._sensor = config, reference, encounter, sensor
+        self._tracker = Tracker(config.tracking)
+        self._filter = SafetyFilter(config.safety, config.limits)
+        self._noise = np.random.default_rng([encounter.seed, 1])
+        self._delay_ticks = round(config.actuation_s / TICK_S)
+        for step in range(-round(WARM_UP_S / TICK_S), 0):
+            self._tracker.update(tuple(self._frames(step, encounter.obstacles)), step * round(TICK_S * NS_PER_S))
+        self._commands: deque[Vec3] = deque([np.zeros(3)] * self._delay_ticks, maxlen=max(self._delay_ticks, 1))
+
+    def tick(self, step: int, p: Vec3, v: Vec3, obstacles: tuple[Obstacle, ...]) -> tuple[Vec3, FilterResult | None]:
+        """The reference and the filter's answer at tick ``step``."""
+        config = self._config
+        now_ns = step * round(TICK_S * NS_PER_S)
+        a_ref = self._reference(v, self._encounter.target_enu - p)
+        if config.safety.filter == "none":
+            return a_ref, None
+        self._tracker.update(tuple(self._frames(step, obstacles)), now_ns)
+        p_act, v_act = p, v
+        for a in list(self._commands)[-self._delay_ticks :] if self._delay_ticks else []:
+            p_act = p_act + v_act * TICK_S + a * (0.5 * TICK_S * TICK_S)
+            v_act = v_act + a * TICK_S
+        start_ns = now_ns + round(self._delay_ticks * TICK_S * NS_PER_S)
+        prediction = self._tracker.predict(start_ns, config.safety.horizon + 3, config.safety.dt_s)
+        result = self._filter.step(
+            FilterInput(p_act, v_act, a_ref, prediction, elapsed_s=TICK_S if step else None)
+        )
+        self._commands.append(result.a_safe)
+        return a_ref, result
+
+    def _frames(self, step: int, obstacles: tuple[Obstacle, ...]) -> Iterator[DetectionFrame]:
+        sensor = self._sensor
+        seen_s = step * TICK_S - sensor.latency_s
+        noise = sensor.noise_std_m * self._noise.standard_normal((len(obstacles), 3))
+        if self._noise.random() < sensor.dropout or not obstacles:
+            return
+        yield DetectionFrame(
+            stamp_ns=round(seen_s * NS_PER_S),
+            source="sensor",
+            sequence=step,
+            kind=DetectionKind.DETECTION,
+            detections=tuple(
+                Detection(
+                    id=str(index),
+                    p_enu=frozen(obstacle.position(np.array(seen_s)) + noise[index]),
+                    radius_m=obstacle.radius_m,
+                    p_std_m=sensor.stated_std_m,
+                )
+                for index, obstacle in enumerate(obstacles)
+            ),
+        )
+
+
+def fly(
+    encounter: Encounter,
+    config: Config,
+    reference: Reference,
+    sensor: Sensor,
+    *,
+    observe: Callable[[int, Vec3, Vec3, Vec3, FilterResult | None], None] | None = None,
+) -> Flight:
+    """One flight to the target or to the time-out; ``observe`` sees (step, p, v, a_ref, result) of each tick."""
+    loop = _Loop(config, reference, encounter, sensor)
+    flight = Flight()
+    p, v, a = encounter.start_enu, np.zeros(3), np.zeros(3)
+    inside_since: float | None = None
+    correction = np.zeros(3)
+    keep = math.exp(-TICK_S / SUBSTEPS / LAG_S)
+    h = TICK_S / SUBSTEPS
+    radii = np.array([config.safety.drone_radius_m + o.radius_m for o in encounter.obstacles])
+    for step in range(round(TIME_OUT_S / TICK_S)):
+        a_ref, result = loop.tick(step, p, v, encounter.obstacles)
+        command = a_ref if result is None else result.a_safe
+        flight.verdicts[(result.verdict if result else Verdict.NOMINAL).value] += 1
+        flight.reversals += int(float((command - a_ref) @ correction) < -1e-6)
+        correction = command - a_ref
+        if observe is not None:
+            observe(step, p, v, a_ref, result)
+        flight.path.append(p)
+        path = np.empty((SUBSTEPS, 3))
+        for substep in range(SUBSTEPS):
+            a = command + (a - command) * keep
+            v = v + a * h
+            p = p + v * h
+            path[substep] = p
+        times = step * TICK_S + h * np.arange(1, SUBSTEPS + 1)
+        for obstacle, reach in zip(encounter.obstacles, radii, strict=True):
+            gap = np.linalg.norm(path - obstacle.position(times), axis=-1).min() - reach
+            flight.clearance_m = min(flight.clearance_m, float(gap))
+        near = math.dist(p, encounter.target_enu) < REACHED_M
+        inside_since = (times[-1] if inside_since is None else inside_since) if near else None
+        if inside_since is not None and times[-1] - inside_since >= DWELL_S:
+            flight.time_s = float(inside_since)
+            break
+    return flight
+
+
+def make_encounter(seed: int, count: int, config: Config, reference: Reference) -> Encounter:
+    """``count`` obstacles timed to cross an 8 m flight; the unfiltered vehicle is hit by the first of them."""
+    rng = np.random.default_rng([seed, 0])
+    unfiltered = _with_filter(config, "none")
+    while True:
+        heading = rng.uniform(-math.pi, math.pi)
+        climb = rng.uniform(-0.15, 0.15)
+        direction = np.array([math.cos(heading) * math.cos(climb), math.sin(heading) * math.cos(climb), math.sin(climb)])
+        middle = np.array([*rng.uniform(-1.5, 1.5, 2), rng.uniform(2.5, 5.0)])
+        start, target = frozen(middle - 4.0 * direction), frozen(middle + 4.0 * direction)
+        free = fly(Encounter(seed, start, target, ()), unfiltered, reference, Sensor())
+        if free.time_s is None:
+            continue
+        path = np.array(free.path)
+        obstacles: list[Obstacle] = []
+        while len(obstacles) < count:
+            obstacle = _obstacle(rng, path, free.time_s)
+            early = np.arange(0.0, 1.0, TICK_S)
+            gap_start = np.linalg.norm(obstacle.position(early) - start, axis=-1).min()
+            after = free.time_s + np.arange(0.0, 6.0, TICK_S)
+            gap_target = np.linalg.norm(obstacle.position(after) - target, axis=-1).min()
+            if gap_start > 2.0 and gap_target > 1.5:
+                obstacles.append(obstacle)
+        encounter = Encounter(seed, start, target, tuple(obstacles))
+        if fly(Encounter(seed, start, target, (obstacles[0],)), unfiltered, reference, Sensor()).clearance_m < 0.0:
+            return encounter
+
+
+def _obstacle(rng: np.random.Generator, path: FloatArray, time_s: float) -> Obstacle:
+    crossing_s = rng.uniform(0.25, 0.75) * time_s
+    p = path[min(round(crossing_s / TICK_S), len(path) - 1)] + rng.uniform(-0.1, 0.1, 3)
+    v = rng.standard_normal(3) * (1.0, 1.0, 0.4)
+    v *= rng.uniform(0.5, 3.0) / np.linalg.norm(v)
+    across = np.cross(v, rng.standard_normal(3))
+    across /= np.linalg.norm(across)
+    motion = MOTIONS[int(rng.integers(len(MOTIONS)))]
+    bend = across if motion == "eight" else rng.uniform(-1.0, 1.0) * v / np.linalg.norm(v)
+    return Obstacle(motion, crossing_s, frozen(p), frozen(v), frozen(bend), rate_rad_s=rng.uniform(0.5, 1.2))
+
+
+def _with_filter(config: Config, name: str) -> Config:
+    import msgspec
+
+    return msgspec.structs.replace(config, safety=msgspec.structs.replace(config.safety, filter=name))
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A set of encounters in figures."""
+
+    flights: int
+    collisions: int
+    deadlocks: int
+    time_ratio_mean: float
+    time_ratio_p95: float
+    clearance_p1_p10_p50_m: tuple[float, float, float]
+    verdict_shares: dict[str, float]
+    relaxed_ticks_per_flight: float
+    reversals_per_flight: float
+    collided_seeds: tuple[int, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+def run(seeds: range, count: int, config: Config, reference: Reference, sensor: Sensor) -> Report:
+    """Fly one encounter a seed, each beside its own unobstructed flight."""
+    flights: list[Flight] = []
+    ratios: list[float] = []
+    for seed in seeds:
+        encounter = make_encounter(seed, count, config, reference)
+        free = fly(Encounter(seed, encounter.start_enu, encounter.target_enu, ()), config, reference, sensor)
+        flight = fly(encounter, config, reference, sensor)
+        flights.append(flight)
+        if flight.time_s is not None and free.time_s is not None:
+            ratios.append(flight.time_s / free.time_s)
+    verdicts = sum((flight.verdicts for flight in flights), Counter())
+    ticks = max(verdicts.total(), 1)
+    clearance = np.array([flight.clearance_m for flight in flights])
+    p1, p10, p50 = (float(value) for value in np.percentile(clearance, (1, 10, 50)))
+    return Report(
+        flights=len(flights),
+        collisions=int((clearance < 0.0).sum()),
+        deadlocks=sum(flight.time_s is None for flight in flights),
+        time_ratio_mean=float(np.mean(ratios)) if ratios else math.nan,
+        time_ratio_p95=float(np.percentile(ratios, 95)) if ratios else math.nan,
+        clearance_p1_p10_p50_m=(p1, p10, p50),
+        verdict_shares={name: number / ticks for name, number in sorted(verdicts.items())},
+        relaxed_ticks_per_flight=verdicts["relaxed"] / len(flights),
+        reversals_per_flight=sum(flight.reversals for flight in flights) / len(flights),
+        collided_seeds=tuple(seed for seed, c in zip(seeds, clearance, strict=True) if c < 0.0),
+    )
