@@ -26,55 +26,52 @@ class Framer:
 
     def push(self, data: bytes) -> list[Any]:
         """pymavlink messages that ``data`` completes. Never raises, whatever the bytes."""
-        data = self._joined(bytes(data))
-        messages: list[Any] = []
-        at = 0
-        while at < len(data):
-            if data[at] not in _MAGICS:
-                start, at = at, _next_magic(data, at)
-                self.counts["garbage_bytes"] += at - start
-                continue
-            message, length, outcome = self._decode(data, at)
-            if length == 0:
-                self._pending = data[at:]
-                break
-            self.counts[outcome] += 1
-            if message is not None:
-                messages.append(message)
-            at += length
-        return messages
-
-    def _joined(self, data: bytes) -> bytes:
-        """What was pending, and ``data``.
-
-        A damaged header must not hold back what follows it: a chunk that begins with a whole good packet does not
-        continue the pending one.
-        """
+        data = bytes(data)
         pending, self._pending = self._pending, b""
         if pending and data and data[0] in _MAGICS and self._decode(data, 0)[0] is not None:
-            self.counts["garbage_bytes"] += len(pending)
-            return data
-        return pending + data
+            # A damaged header must not hold back what follows it: a chunk that begins with a whole good packet
+            # does not continue the pending one.
+            return self._scan(pending, final=True) + self._scan(data, final=False)
+        return self._scan(pending + data, final=False)
 
-    def _decode(self, data: bytes, at: int) -> tuple[Any | None, int, str]:
-        """The message at ``at``, the bytes to step over (0: more are needed, 1: failed) and how to count it."""
+    def _scan(self, data: bytes, *, final: bool) -> list[Any]:
+        messages: list[Any] = []
+        at = 0
+        excused = 0  # up to here lies an unknown message: searched, since its checksum cannot be known, not counted
+        while at < len(data):
+            if data[at] not in _MAGICS:
+                start, at = max(at, excused), _next_magic(data, at)
+                self.counts["garbage_bytes"] += max(0, at - start)
+                continue
+            message, length = self._decode(data, at)
+            if length == 0 and not final and at >= excused:
+                self._pending = data[at:]
+                break
+            if message is None:
+                self.counts["bad_packets"] += at >= excused
+                at += 1
+            elif isinstance(message, dialect.MAVLink_unknown):
+                self.counts["unknown"] += at >= excused
+                excused = max(excused, at + length)
+                at += 1
+            else:
+                self.counts["messages"] += 1
+                messages.append(message)
+                at += length
+        return messages
+
+    def _decode(self, data: bytes, at: int) -> tuple[Any | None, int]:
+        """The message at ``at``, None if it fails, and its length, 0 while more bytes are needed."""
         length = _packet_length(data, at)
         if length == 0 or at + length > len(data):
-            return None, 0, ""
+            return None, 0
         packet = bytearray(data[at : at + length])
         if packet[0] == _V2 and packet[2] & ~_SIGNED:
-            return None, 1, "bad_packets"  # an incompatible feature: the specification says drop
+            return None, length  # an incompatible feature: the specification says drop
         try:
-            message = self._decoder.decode(packet)
+            return self._decoder.decode(packet), length
         except dialect.MAVError:
-            return None, 1, "bad_packets"
-        if isinstance(message, dialect.MAVLink_unknown):
-            # Its checksum cannot be known: believed only if a packet, or nothing, follows it.
-            end = at + length
-            if end < len(data) and data[end] not in _MAGICS:
-                return None, 1, "bad_packets"
-            return None, length, "unknown"
-        return message, length, "messages"
+            return None, length
 
 
 def _packet_length(data: bytes, at: int) -> int:
