@@ -15,6 +15,8 @@ from sim_bridge.physics import BodyState, World
 from sim_bridge.placement import Resolved
 from sim_bridge.sensors import Frame, Sensor
 
+_NEAR_M = 1.0  # closer than this, each obstacle's approach is looked at in every physics step, else in every period
+
 
 class Flight:
     """One vehicle, one scenario, no wires. Time is the count of physics steps."""
@@ -78,8 +80,9 @@ class Flight:
         self._sense()
         if self.judge is not None:
             grounded = world.on_ground and autopilot.mode is Mode.OFFBOARD
-            obstacles_enu = world.obstacle_positions(world.t_s)
-            self.judge.step(self.t_ns, world.state.p_enu, obstacles_enu, grounded=grounded)
+            self.judge.step(self.t_ns, world.state.p_enu, world.clearance_m, grounded=grounded)
+            if world.clearance_m < _NEAR_M or self.at_tick:
+                self.judge.approach(self.t_ns, world.state.p_enu, world.obstacle_positions(world.t_s))
 
     def control(self) -> tuple[Reply, ...]:
         """The autopilot's look at the clock, once a control period."""

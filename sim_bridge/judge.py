@@ -29,7 +29,7 @@ class Judge:
     """One flight, from ``start_ns`` on.
 
     Args:
-        radius_m: the vehicle's; ids, radii_m: the obstacles', in the order of the positions given to `step`.
+        radius_m: the vehicle's; ids, radii_m: the obstacles', in the order of the positions given to `approach`.
     """
 
     def __init__(
@@ -56,20 +56,23 @@ class Judge:
         self._nearest_m = [math.inf] * len(ids)
         self._ids = tuple(ids)
 
-    def step(self, t_ns: int, p_enu: Vec3, obstacles_enu: Sequence[Vec3], *, grounded: bool) -> None:
+    def step(self, t_ns: int, p_enu: Vec3, clearance_m: float, *, grounded: bool) -> None:
         """Take the state after one physics step; ``grounded``: the vehicle touches the ground where it must not."""
+        self.min_clearance_m = min(self.min_clearance_m, clearance_m)
+        if self.collided_ns is None and (grounded or self.min_clearance_m <= 0.0):
+            self.collided_ns = t_ns
+        if self._target_enu is not None and self.reached_ns is None:
+            self._watch_arrival(self._target_enu, t_ns, p_enu)
+        self._last = (t_ns, p_enu)
+
+    def approach(self, t_ns: int, p_enu: Vec3, obstacles_enu: Sequence[Vec3]) -> None:
+        """Keep the closest approach of each obstacle; positions in the order of ``ids``."""
         for i, p_obstacle_enu in enumerate(obstacles_enu):
             clearance_m = math.dist(p_enu, p_obstacle_enu) - self._reach_sum_m[i]
             if clearance_m < self._nearest_m[i]:
                 self._nearest_m[i] = clearance_m
                 since_s = (t_ns - self.start_ns) / NS_PER_S
                 self.approaches[i] = Approach(self._ids[i], since_s, clearance_m, p_enu, p_obstacle_enu)
-                self.min_clearance_m = min(self.min_clearance_m, clearance_m)
-        if self.collided_ns is None and (grounded or self.min_clearance_m <= 0.0):
-            self.collided_ns = t_ns
-        if self._target_enu is not None and self.reached_ns is None:
-            self._watch_arrival(self._target_enu, t_ns, p_enu)
-        self._last = (t_ns, p_enu)
 
     def verdict(self, t_ns: int) -> str | None:
         """Why the flight is over, or None."""

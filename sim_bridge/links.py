@@ -51,6 +51,8 @@ class Link:
 
     def send(self, data: bytes) -> None:
         """To the configured port and to everybody else who spoke to this link; nobody there is no error."""
+        if not data:
+            return
         for address in (self._home, *self._peers):
             with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
                 self.socket.sendto(data, address)

@@ -109,8 +109,10 @@ class Lockstep:
             bridge.publish_marker(source, flight.t_ns, frames)
         self._station.say(flight.control())
         self._station.announce()
+        self._station.stream(self._wires.router.onboard)
+        # the companion computes now: what it does not wait for is done beside it
+        self._station.stream(self._wires.router.ground)
         self._trace.write(flight)
-        self._station.stream()
 
     def _await_answer(self) -> None:
         answer = self._answer

@@ -147,14 +147,14 @@ class RealTime:
             self._tick()
         else:
             self._publish()
-            self._station.stream()
+            self._station.stream(*self._wires.router.links)
 
     def _tick(self) -> None:
         flight = self.flight
         self._station.say(flight.control())
         self._station.announce()
         self._publish()
-        self._station.stream()
+        self._station.stream(*self._wires.router.links)
         self._trace.write(flight)
         self._progress(flight)
 

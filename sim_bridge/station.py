@@ -97,14 +97,14 @@ class Station:
             self.send(EXTENDED_SYS_STATE)
         self._announced = status
 
-    def stream(self) -> None:
-        """Send what is due on each link."""
+    def stream(self, *links: Link) -> None:
+        """Send what is due on each of ``links``, one datagram a link."""
         t_ns = self._flight.t_ns
-        now: Moment | None = None
-        for link, streams in self._streams.items():
-            for message_id in streams.due(t_ns):
-                now = self._moment() if now is None else now
-                self._send_one(link, message_id, now)
+        for link in links:
+            due = self._streams[link].due(t_ns)
+            if due:
+                now = self._moment()
+                link.send(b"".join(build(message_id, now, link.encoder) for message_id in due))
 
     def stay_alive(self) -> None:
         """While time is held: a heartbeat on both links, and what tells the ground station that we are healthy."""
@@ -120,9 +120,7 @@ class Station:
             self._send_one(link, message_id, now)
 
     def _send_one(self, link: Link, message_id: int, now: Moment) -> None:
-        data = build(message_id, now, link.encoder)
-        if data is not None:
-            link.send(data)
+        link.send(build(message_id, now, link.encoder))
 
     def _moment(self) -> Moment:
         return Moment(self._flight.t_ns, self._flight.state, self._flight.autopilot)

@@ -231,7 +231,7 @@ class Streams:
         return ready
 
 
-def build(message_id: int, now: Moment, encoder: Encoder) -> bytes | None:
-    """Bytes of one message now, None where it has nothing to tell."""
+def build(message_id: int, now: Moment, encoder: Encoder) -> bytes:
+    """Bytes of one message now, none where it has nothing to tell."""
     message = BUILDERS[message_id](now)
-    return None if message is None else encoder.pack(message)
+    return b"" if message is None else encoder.pack(message)

@@ -276,7 +276,11 @@ def test_a_port_in_use_is_one_line_and_status_2(tmp_path: Path) -> None:
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         arguments = ["run", "--scenario", "empty", "--zenoh-listen", endpoint]
         done = subprocess.run(
-            [sys.executable, "-m", "sim_bridge.cli", *arguments], capture_output=True, timeout=30, check=False, text=True
+            [sys.executable, "-m", "sim_bridge.cli", *arguments],
+            capture_output=True,
+            timeout=30,
+            check=False,
+            text=True,
         )
     assert done.returncode == 2
     complaint = [line for line in done.stderr.splitlines() if line.startswith("sim-bridge: ")]
