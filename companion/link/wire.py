@@ -28,6 +28,7 @@ MAX_STD_M = 1e4
 FUTURE_NS = NS_PER_S // 10
 
 Vec = tuple[float, float, float]
+Nanoseconds = Annotated[int, Meta(ge=-(2**63) + 1, le=2**63 - 1)]
 Frame = Literal["local_enu", "local_ned"]
 
 
@@ -46,7 +47,7 @@ class Obstacle(Struct, frozen=True, kw_only=True):
 class ObstacleFrame(Struct, frozen=True, kw_only=True):
     """`{prefix}/obstacles/{source}`: everything one source sees at ``stamp_ns``."""
 
-    stamp_ns: int
+    stamp_ns: Nanoseconds
     clock: Literal["unix", "vehicle"]
     frame: Frame = "local_enu"
     kind: Literal["detection", "track"] = "detection"
@@ -56,7 +57,7 @@ class ObstacleFrame(Struct, frozen=True, kw_only=True):
 class VehicleStateIn(Struct, frozen=True, kw_only=True):
     """`{prefix}/vehicle/state`: the vehicle by Zenoh instead of MAVLink (vehicle.source = "zenoh")."""
 
-    stamp_ns: int
+    stamp_ns: Nanoseconds
     frame: Frame = "local_enu"
     position: Vec
     velocity: Vec
@@ -89,8 +90,8 @@ class Reply(Struct, frozen=True, kw_only=True):
 class SyncMarker(Struct, frozen=True, kw_only=True):
     """`{prefix}/sync/{source}`, lockstep only: all frames through ``through_ns`` are sent, ``frames`` of them new."""
 
-    through_ns: int
-    frames: Annotated[int, Meta(ge=0)]
+    through_ns: Nanoseconds
+    frames: Annotated[int, Meta(ge=0, le=4096)]
 
 
 class MarginOut(Struct, frozen=True, kw_only=True):
