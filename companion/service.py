@@ -122,13 +122,13 @@ class Service:
         """
         config = self._config
         loop = asyncio.get_running_loop()
-        with contextlib.ExitStack() as stack:
+        async with contextlib.AsyncExitStack() as stack:
             recorder = None
             if config.log.directory is not None:
                 recorder = Recorder(Path(config.log.directory) / "flight.mcap", config)
                 stack.callback(recorder.close)
             self._transport = await open_transport(config.mavlink.url, self._on_bytes, clock=self._clock)
-            stack.callback(self._transport.close)
+            stack.push_async_callback(self._transport.close)
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
             self._publisher = Publisher(zenoh, recorder)

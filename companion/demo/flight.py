@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.demo.operator import OperatorError, take_off_and_engage
 from companion.errors import CompanionError, ConfigError
 
 STOP_S = 5.0  # a process that was asked to stop is given this long
@@ -74,7 +73,6 @@ async def fly(plan: FlightPlan, on_progress: Callable[[str], None]) -> FlightRes
 
     Raises:
         FlightFailed: a process died or said no.
-        OperatorError: the operator was refused.
     """
     plan.folder.mkdir(parents=True, exist_ok=True)
     onboard, gcs = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
@@ -88,24 +86,21 @@ async def fly(plan: FlightPlan, on_progress: Callable[[str], None]) -> FlightRes
     async with (
         _Process(sim_words, plan.folder / "sim-bridge.log") as simulator,
         _Process(daemon_words, plan.folder / "companion.log") as daemon,
+        _Process(["companion.demo.operator", str(gcs)], plan.folder / "operator.log", on_line=on_progress) as operator,
     ):
-        operator = asyncio.create_task(take_off_and_engage(gcs, on_progress))
-        try:
-            simulated = await _first_of(simulator, daemon, operator, on_progress)
-        finally:
-            operator.cancel()
-            await asyncio.gather(operator, return_exceptions=True)
-        answered = await daemon.stop()
+        simulated = await _until_flown(simulator, daemon, operator)
+        answered = _parsed(await daemon.stop(), daemon)
     return FlightResult(simulated, answered, trace)
 
 
 class _Process:
-    """A Python module as a child process whose standard output is one JSON object; ends it on exit."""
+    """A Python module as a child process; its standard error goes to a log, its end is awaited or forced on exit."""
 
-    def __init__(self, words: Sequence[str], log: Path) -> None:
+    def __init__(self, words: Sequence[str], log: Path, *, on_line: Callable[[str], None] | None = None) -> None:
         self._words = words
         self._log = log
-        self.name = words[0].partition(".")[0]
+        self._on_line = on_line
+        self.name = words[0].rpartition(".cli")[0] or words[0]
 
     async def __aenter__(self) -> _Process:
         self._log_file = self._log.open("wb")
@@ -117,31 +112,37 @@ class _Process:
             stdout=asyncio.subprocess.PIPE,
             stderr=self._log_file,
         )
-        self._output = asyncio.create_task(self._child.communicate())
+        self.ended = asyncio.create_task(self._read())
         return self
 
     async def __aexit__(self, *exc: object) -> None:
         if self._child.returncode is None:
             self._child.kill()
-        await self._output
+        await asyncio.gather(self.ended, return_exceptions=True)
         self._log_file.close()
 
-    async def result(self) -> dict[str, Any]:
-        """Its JSON, once it ends by itself."""
-        output, _ = await asyncio.shield(self._output)
-        lines = output.decode().strip().splitlines()
-        if not lines:
-            raise FlightFailed(f"{self.name}: exit status {self._child.returncode}: {self.last_words()}")
-        parsed: dict[str, Any] = json.loads(lines[-1])
-        return parsed
+    async def _read(self) -> list[str]:
+        """Every line of its standard output, once it has ended."""
+        assert self._child.stdout is not None
+        lines: list[str] = []
+        async for line in self._child.stdout:
+            lines.append(line.decode().rstrip("\n"))
+            if self._on_line is not None:
+                self._on_line(lines[-1])
+        await self._child.wait()
+        return lines
 
-    async def stop(self) -> dict[str, Any]:
-        """Its JSON, after SIGTERM."""
+    @property
+    def status(self) -> int | None:
+        return self._child.returncode
+
+    async def stop(self) -> list[str]:
+        """Its output, after SIGTERM."""
         if self._child.returncode is None:
             self._child.send_signal(signal.SIGTERM)
         try:
             async with asyncio.timeout(STOP_S):
-                return await self.result()
+                return await asyncio.shield(self.ended)
         except TimeoutError:
             raise FlightFailed(f"{self.name}: did not stop within {STOP_S:g} s of SIGTERM") from None
 
@@ -151,26 +152,28 @@ class _Process:
         return lines[-1] if lines else "it said nothing"
 
 
-async def _first_of(
-    simulator: _Process, daemon: _Process, operator: asyncio.Task[None], on_progress: Callable[[str], None]
-) -> dict[str, Any]:
-    """The simulator's summary; whatever else ends first with an error ends the flight."""
-    flown = asyncio.create_task(simulator.result())
-    daemon_died = asyncio.create_task(daemon.result())
-    try:
-        await asyncio.wait({flown, daemon_died, operator}, return_when=asyncio.FIRST_COMPLETED)
-        if operator.done() and not flown.done() and not daemon_died.done():
-            operator.result()
-            on_progress("fly")
-            await asyncio.wait({flown, daemon_died}, return_when=asyncio.FIRST_COMPLETED)
-        if flown.done():
-            return flown.result()
-        daemon_died.result()
-        raise FlightFailed(f"companion: ended before the flight did: {daemon.last_words()}")
-    finally:
-        for task in (flown, daemon_died):
-            task.cancel()
-        await asyncio.gather(flown, daemon_died, return_exceptions=True)
+async def _until_flown(simulator: _Process, daemon: _Process, operator: _Process) -> dict[str, Any]:
+    """The simulator's summary; a daemon that ends or an operator that fails before it ends the flight."""
+    while not simulator.ended.done():
+        waiting = [process.ended for process in (simulator, daemon, operator) if not process.ended.done()]
+        await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        if simulator.ended.done():
+            break
+        if daemon.ended.done():
+            kind = ConfigError if daemon.status == 2 else FlightFailed
+            raise kind(f"{daemon.name} ended before the flight did: {daemon.last_words()}")
+        if operator.ended.done() and operator.status != 0:
+            raise FlightFailed(f"{operator.name}: {operator.last_words()}")
+    return _parsed(simulator.ended.result(), simulator)
+
+
+def _parsed(lines: list[str], process: _Process) -> dict[str, Any]:
+    """The JSON object that a process printed last."""
+    if not lines:
+        kind = ConfigError if process.status == 2 else FlightFailed
+        raise kind(f"{process.name}: exit status {process.status}: {process.last_words()}")
+    parsed: dict[str, Any] = json.loads(lines[-1])
+    return parsed
 
 
 def _daemon_arguments(plan: FlightPlan, onboard: int, endpoint: str) -> list[str]:
@@ -199,6 +202,3 @@ def _free_port(kind: socket.SocketKind) -> int:
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-__all__ = ["FlightFailed", "FlightPlan", "FlightResult", "OperatorError", "describe_scenario", "fly"]

@@ -1,6 +1,8 @@
 """The operator of the demo: MAVSDK on the simulator's ground station link, as a person with a ground station would.
 
-Never MAVSDK's Offboard plugin: it streams setpoints of its own beside the daemon's.
+Run as a process of its own (``python -m companion.demo.operator PORT``), because MAVSDK cannot be left while one of
+its calls waits for an answer. Prints each step as it begins; exit status 1 and one line on standard error if one
+fails. Never MAVSDK's Offboard plugin: it streams setpoints of its own beside the daemon's.
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import sys
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -105,3 +108,24 @@ async def _until(updates: AsyncIterator[T], accept: Callable[[T], bool], step: s
                         return
         except TimeoutError:
             raise OperatorError(f"operator: {step}: expected within {HOVER_S:g} s") from None
+
+
+def main(arguments: list[str]) -> int:
+    """Fly as the operator on the UDP port given; MAVSDK's own messages go to standard error."""
+    from mavsdk.logging import log_subscribe
+
+    def write(level: Any, message: str, file: str | None, line: int) -> bool:
+        print(level.name, message, file=sys.stderr)
+        return True
+
+    log_subscribe(write)
+    try:
+        asyncio.run(take_off_and_engage(int(arguments[0]), lambda step: print(step, flush=True)))
+    except OperatorError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
