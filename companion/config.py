@@ -76,6 +76,7 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     accel_psd_cv: Positive = 0.004  # white acceleration PSD of CV [m^2/s^3]
     jerk_psd_ca: Positive = 57.0  # white jerk PSD of CA [m^2/s^5]
     accel_psd_ct: Positive = 0.37  # white acceleration PSD of CT [m^2/s^3]
+    accel_memory_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.5  # CA's acceleration dies out in predictions; 0: never
     turn_psd_ct: Positive = 0.03  # white turn acceleration PSD of CT [rad^2/s^3]
     q_paper: NonNegative = 0.0  # > 0: Q = q_paper I per dt_s for every model (Remark 1)
     measurement_variance_m2: Positive = 0.05  # used where a detection states no position_std (Remark 1)
@@ -120,9 +121,10 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     drone_radius_m: Positive = 0.2
     cushion_m: NonNegative = 0.1
     kappa: NonNegative = 2.0
-    sigma_growth_s: NonNegative = 5.0  # predicted sigma is counted up to this far ahead, later rows keep that value
-    sigma_cap_m: Positive = 10.0  # and kappa sigma no further than this: a track just born is no wall
+    sigma_growth_s: NonNegative = 0.5  # predicted sigma counts up to this far ahead; the next looks correct the rest
+    sigma_cap_m: Positive = 1.5  # kappa sigma counts no further than this: a track just born is no wall
     sigma_delay_s: NonNegative = 0.01
+    recovery: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02  # least decay of psi per dt_s inside the keep-out distance
     solver: Literal["daqp", "osqp"] = "daqp"
     iterations: Annotated[int, Meta(ge=1, le=50)] = 6
     tolerance_m_s2: Positive = 1e-6
@@ -197,6 +199,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "horizon": 5,
             "kappa": 0.0,
             "sigma_delay_s": 0.0,
+            "recovery": 0.0,
             "lambda_epsilon": 10.0,
             "lambda_delta": 1e4,
         },
@@ -210,6 +213,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "stay_probability": 0.6,
             "turn_rate": "window",
             "likelihood_window": 2,
+            "accel_memory_s": 0.0,
         },
     },
 }

@@ -2,7 +2,9 @@
 
 For a given acceleration a row rise + e psi >= 0 is affine in the decay e = alpha2 epsilon: it bounds e from below
 where psi > 0 (the obstacle may be approached, no faster than e) and from above where psi < 0 (the vehicle is inside
-the keep-out distance and must leave it, no slower than e). Rows of one obstacle share one e.
+the keep-out distance and leaves it no slower than e). Rows of one obstacle share one e. With psi < 0 and e = 0 a row
+would ask only that psi does not fall further, and a vehicle at rest inside would be left there; so an obstacle with
+psi_0 < 0 has a least decay, the configuration's ``recovery``.
 """
 
 from __future__ import annotations
@@ -40,16 +42,18 @@ def clf_budget(previous: FloatArray, star: FloatArray, elapsed_s: FloatArray, et
     return np.asarray((1.0 - eta) ** (elapsed_s / CLF_PERIOD_S) * (previous - star) ** 2)
 
 
-def decay_interval(rise: FloatArray, psi: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least and greatest decay in [0, 1] with rise + e psi >= 0 for all rows of an obstacle.
+def decay_interval(rise: FloatArray, psi: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least and greatest decay in [least, 1] with rise + e psi >= 0 for all rows of an obstacle.
 
     Args:
         rise, psi: (..., R) [m^2].
+        least: broadcast to (...,), 0 or the recovery.
     Returns:
         (lower, upper), each (...,); lower > upper where no decay serves.
     """
     bound = -rise / np.where(np.abs(psi) < _TINY, _TINY, psi)
     opening = psi > -_TINY
-    lower = np.where(opening, bound, 0.0).max(axis=-1, initial=0.0)
-    upper = np.where(opening, 1.0, bound).min(axis=-1, initial=1.0)
+    lower = np.maximum(np.where(opening, bound, 0.0).max(axis=-1), least)
+    upper = np.where(opening, 1.0, bound).min(axis=-1)
+    upper = np.minimum(upper, 1.0)
     return lower, upper

@@ -54,6 +54,7 @@ class BarrierRows:
     cushion_m: float
     sigma_m: FloatArray  # (M, R) kappa sigma
     delay_m: FloatArray  # (M,) |v_r| sigma_delay
+    least_decay: FloatArray  # (M,) 0, or the recovery where psi_0 < 0 (which no acceleration changes)
     keep_out_m: FloatArray  # (M, R) the |r| that a row holds: D, or sqrt(2) D to the letter of (22)
 
     def __len__(self) -> int:
@@ -102,6 +103,7 @@ class BarrierRows:
             cushion_m=self.cushion_m,
             sigma_m=self.sigma_m[obstacles],
             delay_m=self.delay_m[obstacles],
+            least_decay=self.least_decay[obstacles],
             keep_out_m=self.keep_out_m[obstacles],
         )
 
@@ -155,5 +157,6 @@ class Barrier:
             cushion_m=config.cushion_m,
             sigma_m=sigma,
             delay_m=delay,
+            least_decay=np.where(psi[:, 0, 0] < 0.0, config.recovery, 0.0),
             keep_out_m=keep_out,
         )

@@ -72,7 +72,7 @@ class SafetyFilter:
             ValueError: the prediction is shorter than horizon + 3 instants.
         """
         task = self._task(inputs)
-        lower, upper = decay_interval(*task.rows.evaluate(inputs.a_ref))
+        lower, upper = decay_interval(*task.rows.evaluate(inputs.a_ref), task.rows.least_decay)
         if bool((lower <= upper).all()) and task.limits.admits(inputs.a_ref):
             found = Found(inputs.a_ref, lower / self._safety.alpha2, True, 0.0, 0, "none")
             return self._answer(task, found, Verdict.NOMINAL)
@@ -108,7 +108,7 @@ class SafetyFilter:
             found, fallback = solve_task(reduced, self._last, self._order), False
         except SolverError:
             found, fallback = braking(reduced, self._last), True
-        lower, upper = decay_interval(*task.rows.evaluate(found.a))
+        lower, upper = decay_interval(*task.rows.evaluate(found.a), task.rows.least_decay)
         epsilon = np.minimum(np.maximum(task.star, lower / self._safety.alpha2), upper / self._safety.alpha2)
         epsilon[near] = found.epsilon
         return Found(found.a, epsilon, found.admissible, found.cost, found.iterations, found.solver), fallback

@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.config import SafetyConfig
+from companion.errors import SolverError
 from companion.safety.adapt import decay_interval
 from companion.safety.barrier import BarrierRows
 from companion.safety.limits import VehicleLimits
@@ -89,7 +90,7 @@ def within_reach(rows: BarrierRows, limits: VehicleLimits) -> npt.NDArray[np.boo
 def judge(task: Task, a: FloatArray) -> Judgement:
     """True rows and limits at ``a`` (C, 3), all in one batch."""
     config = task.config
-    lower, upper = decay_interval(*task.rows.evaluate_many(a))
+    lower, upper = decay_interval(*task.rows.evaluate_many(a), task.rows.least_decay)
     lower, upper = lower / config.alpha2, upper / config.alpha2
     admissible = (lower <= upper).all(axis=-1) & (task.limits.slow(a) <= config.tolerance_m_s2)
     epsilon = np.minimum(np.maximum(task.star, lower), upper)
@@ -139,8 +140,10 @@ def least_cost(task: Task, start: Found, order: tuple[str, ...]) -> Found:
     for count in range(1, task.config.iterations + 1):
         try:
             x, solver = solve(_tangent_program(task, a, epsilon), order)
-        except Infeasible:
-            break
+        except SolverError as error:
+            if best.iterations or isinstance(error, Infeasible):
+                break
+            raise
         previous = a
         tried = task.limits.clip(a + _STEPS * (x[:3] - a))
         verdict = judge(task, tried)
@@ -185,7 +188,7 @@ def _tangent_program(task: Task, a: Vec3, epsilon: FloatArray) -> Program:
         weight=2.0
         * np.concatenate((np.full(3, config.lambda_u), config.lambda_epsilon * each, config.lambda_delta * each)),
         linear=-2.0 * np.concatenate((config.lambda_u * task.a_ref, config.lambda_epsilon * task.star, 0.0 * each)),
-        low=np.concatenate((limits.low, np.zeros(2 * count))),
+        low=np.concatenate((limits.low, task.rows.least_decay / config.alpha2, 0.0 * each)),
         high=np.concatenate((limits.high, top * each, UNBOUNDED * each)),
         rows=rows,
         floor=floors,
@@ -225,7 +228,7 @@ def _widest(task: Task, starts: FloatArray, low: Vec3, high: Vec3, order: tuple[
         previous, a = a, np.clip(x[:3], low, high)
         if float(np.abs(a - previous).max()) < SETTLED_M_S2:
             break
-    lower, upper = decay_interval(*task.rows.evaluate(a))
+    lower, upper = decay_interval(*task.rows.evaluate(a), task.rows.least_decay)
     epsilon = np.clip(0.5 * (lower + upper), 0.0, 1.0) / task.config.alpha2
     return Found(a, epsilon, False, np.inf, count, solver)
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from companion.config import Config
@@ -149,9 +150,7 @@ class _Loop:
             v_act = v_act + a * TICK_S
         start_ns = now_ns + round(self._delay_ticks * TICK_S * NS_PER_S)
         prediction = self._tracker.predict(start_ns, config.safety.horizon + 3, config.safety.dt_s)
-        result = self._filter.step(
-            FilterInput(p_act, v_act, a_ref, prediction, elapsed_s=TICK_S if step else None)
-        )
+        result = self._filter.step(FilterInput(p_act, v_act, a_ref, prediction, elapsed_s=TICK_S if step else None))
         self._commands.append(result.a_safe)
         return a_ref, result
 
@@ -229,7 +228,8 @@ def make_encounter(seed: int, count: int, config: Config, reference: Reference) 
     while True:
         heading = rng.uniform(-math.pi, math.pi)
         climb = rng.uniform(-0.15, 0.15)
-        direction = np.array([math.cos(heading) * math.cos(climb), math.sin(heading) * math.cos(climb), math.sin(climb)])
+        level = math.cos(climb)
+        direction = np.array([math.cos(heading) * level, math.sin(heading) * level, math.sin(climb)])
         middle = np.array([*rng.uniform(-1.5, 1.5, 2), rng.uniform(2.5, 5.0)])
         start, target = frozen(middle - 4.0 * direction), frozen(middle + 4.0 * direction)
         free = fly(Encounter(seed, start, target, ()), unfiltered, reference, Sensor())
@@ -263,8 +263,6 @@ def _obstacle(rng: np.random.Generator, path: FloatArray, time_s: float) -> Obst
 
 
 def _with_filter(config: Config, name: str) -> Config:
-    import msgspec
-
     return msgspec.structs.replace(config, safety=msgspec.structs.replace(config.safety, filter=name))
 
 

@@ -23,18 +23,14 @@ CONFIG = SafetyConfig()
         ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0),  # on top of each other: defined, and strict
     ],
 )
-def test_epsilon_star_by_hand(
-    p_rel: tuple[float, ...], v_rel: tuple[float, ...], expected: float
-) -> None:
+def test_epsilon_star_by_hand(p_rel: tuple[float, ...], v_rel: tuple[float, ...], expected: float) -> None:
     assert epsilon_star(np.array([p_rel]), np.array([v_rel]), CONFIG)[0] == pytest.approx(expected)
 
 
 def test_clf_budget_halves_each_twentieth_of_a_second() -> None:
     budget = clf_budget(np.array([2.0, 2.0, 2.0]), np.zeros(3), np.array([0.05, 0.10, 0.0]), 0.5)
     assert budget == pytest.approx([2.0, 1.0, 4.0])
-    assert clf_budget(np.array([2.0]), np.array([0.5]), np.array([0.02]), 0.5)[0] == pytest.approx(
-        0.5**0.4 * 1.5**2
-    )
+    assert clf_budget(np.array([2.0]), np.array([0.5]), np.array([0.02]), 0.5)[0] == pytest.approx(0.5**0.4 * 1.5**2)
 
 
 @pytest.mark.parametrize(
@@ -48,24 +44,32 @@ def test_clf_budget_halves_each_twentieth_of_a_second() -> None:
         ((0.1,), (0.0,), (0.0, 1.0)),
     ],
 )
-def test_decay_interval_by_hand(
-    rise: tuple[float, ...], psi: tuple[float, ...], expected: tuple[float, float]
-) -> None:
-    lower, upper = decay_interval(np.array([rise]), np.array([psi]))
+def test_decay_interval_by_hand(rise: tuple[float, ...], psi: tuple[float, ...], expected: tuple[float, float]) -> None:
+    lower, upper = decay_interval(np.array([rise]), np.array([psi]), np.zeros(1))
     assert (lower[0], upper[0]) == pytest.approx(expected)
 
 
 def test_a_row_with_psi_zero_and_falling_has_no_decay() -> None:
-    lower, upper = decay_interval(np.array([[-0.1]]), np.array([[0.0]]))
+    lower, upper = decay_interval(np.array([[-0.1]]), np.array([[0.0]]), np.zeros(1))
     assert lower[0] > upper[0]
 
 
 def test_interval_against_brute_force() -> None:
     rng = np.random.default_rng(3)
     rise, psi = rng.normal(0.3, 1.0, (200, 5)), rng.normal(0.5, 1.0, (200, 5))
-    lower, upper = decay_interval(rise, psi)
+    lower, upper = decay_interval(rise, psi, np.zeros(200))
     grid = np.linspace(0.0, 1.0, 1001)
     holds = (rise[:, None, :] + grid[:, None] * psi[:, None, :] >= 0.0).all(axis=-1)
     inside = (grid >= lower[:, None]) & (grid <= upper[:, None])
     assert 20 < holds.any(axis=-1).sum() < 180
     assert (holds == inside).all()
+
+
+def test_inside_the_keep_out_distance_the_decay_has_a_floor() -> None:
+    """At rest inside: psi_0 < 0 and nothing changes; without a floor decay 0 would call that admissible."""
+    rise, psi = np.array([[0.0, 0.0]]), np.array([[-0.1, -0.1]])
+    assert decay_interval(rise, psi, np.zeros(1))[0][0] == 0.0
+    lower, upper = decay_interval(rise, psi, np.array([0.02]))
+    assert lower[0] > upper[0]
+    leaving = decay_interval(rise + 0.01, psi, np.array([0.02]))
+    assert (leaving[0][0], leaving[1][0]) == pytest.approx((0.02, 0.1))

@@ -42,7 +42,10 @@ def row_by_definition(
     for _ in range(config.horizon + 3):
         positions.append(p)
         p, v = p + dt * v, v + dt * a
-    sigma = config.kappa * math.hypot(prediction.sigma_m[j, i + 2], p_std_m)
+    sigma = min(
+        config.kappa * math.hypot(prediction.sigma_m[j, min(i + 2, round(config.sigma_growth_s / dt))], p_std_m),
+        config.sigma_cap_m,
+    )
     delay = config.sigma_delay_s * float(np.linalg.norm(prediction.v_enu[j] - V))
     d = config.drone_radius_m + prediction.radius_m[j] + config.cushion_m + sigma + delay
     keep = d * d if config.form == "paper" else 0.5 * d * d

@@ -1,0 +1,312 @@
+"""The whole filter: identity, adjustment, least violation, failing solvers, symmetry, memory."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.config import LimitsConfig, SafetyConfig, parse_config
+from companion.errors import SolverError
+from companion.safety import qp, search
+from companion.safety.barrier import Barrier
+from companion.safety.filter import FilterInput, SafetyFilter
+from companion.types import FilterResult, Prediction, Verdict, frozen
+
+SAFETY = SafetyConfig(sigma_delay_s=0.0)
+LIMITS = LimitsConfig()
+
+
+def straight(
+    p: list[tuple[float, ...]],
+    v: list[tuple[float, ...]],
+    *,
+    sigma: float = 0.0,
+    radius: float = 0.2,
+    horizon: int = 20,
+) -> Prediction:
+    """Obstacles in uniform motion, known exactly."""
+    count, t = len(p), 0.05 * np.arange(horizon + 3)
+    start, velocity = np.reshape(p, (count, 3)), np.reshape(v, (count, 3))
+    return Prediction(
+        start_ns=0,
+        dt_s=0.05,
+        ids=tuple(f"s/{index}" for index in range(count)),
+        p_enu=frozen(start[:, None] + t[:, None] * velocity[:, None]),
+        sigma_m=frozen(np.full((count, len(t)), sigma)),
+        v_enu=frozen(velocity),
+        a_enu=frozen(np.zeros((count, 3))),
+        radius_m=frozen(np.full(count, radius)),
+    )
+
+
+def tick(
+    prediction: Prediction,
+    *,
+    p: tuple[float, ...] = (0.0, 0.0, 2.0),
+    v: tuple[float, ...] = (2.0, 0.0, 0.0),
+    a: tuple[float, ...] = (1.0, 0.0, 0.0),
+    limits_on: bool = True,
+    elapsed_s: float | None = 0.05,
+) -> FilterInput:
+    return FilterInput(np.array(p), np.array(v), np.array(a), prediction, limits_on=limits_on, elapsed_s=elapsed_s)
+
+
+def true_slack(inputs: FilterInput, result: FilterResult, config: SafetyConfig = SAFETY) -> float:
+    """The least slack of all rows of all obstacles, from the recorded epsilons, recomputed from nothing else."""
+    rows = Barrier(config).rows(inputs.p_enu, inputs.v_enu, inputs.prediction, inputs.p_std_m)
+    epsilon = {record.track: record.epsilon for record in result.rows}
+    decay = config.alpha2 * np.array([epsilon[name] for name in rows.ids])
+    rise, psi = rows.evaluate(result.a_safe)
+    _, norm = rows.gradient(result.a_safe, decay)
+    return float(((rise + decay[:, None] * psi) / norm).min())
+
+
+def test_without_obstacles_the_reference_passes() -> None:
+    inputs = tick(straight([], []))
+    result = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    assert result.verdict is Verdict.NOMINAL
+    assert result.a_safe.tobytes() == inputs.a_ref.tobytes()
+    assert result.worst is None
+    assert result.rows == ()
+    assert result.iterations == 0
+
+
+def test_an_admissible_reference_passes_with_the_least_epsilon() -> None:
+    """Head-on from 5 m at 1 m/s: every row at that epsilon holds, at a little less one breaks."""
+    inputs = tick(straight([(5.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)]), v=(1.0, 0.0, 0.0), a=(0.0, 0.0, 0.0))
+    result = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    assert result.verdict is Verdict.NOMINAL
+    epsilon = result.rows[0].epsilon
+    assert 0.0 < epsilon < 2.0
+    rows = Barrier(SAFETY).rows(inputs.p_enu, inputs.v_enu, inputs.prediction, 0.0)
+    rise, psi = rows.evaluate(inputs.a_ref)
+    assert (rise + 0.5 * epsilon * psi).min() == pytest.approx(0.0, abs=1e-12)
+    assert (rise + 0.5 * (epsilon - 1e-6) * psi).min() < 0.0
+
+
+def test_the_answer_is_read_only() -> None:
+    result = SafetyFilter(SAFETY, LIMITS).step(tick(straight([], [])))
+    with pytest.raises(ValueError, match="read-only"):
+        result.a_safe[0] = 1.0
+
+
+@pytest.mark.parametrize("solver", ["daqp", "osqp"])
+def test_a_collision_course_is_adjusted_and_every_true_row_holds(solver: str) -> None:
+    config = msgspec.structs.replace(SAFETY, solver=solver)
+    inputs = tick(straight([(2.5, 0.1, 2.0), (2.0, -1.2, 2.0), (9.0, 9.0, 9.0)], [(-1.0, 0.0, 0.0)] * 3))
+    result = SafetyFilter(config, LIMITS).step(inputs)
+    assert result.verdict is Verdict.ADJUSTED
+    assert not np.array_equal(result.a_safe, inputs.a_ref)
+    assert np.abs(result.a_safe).max() <= 3.0
+    assert true_slack(inputs, result) >= -1e-6
+    assert {record.track for record in result.rows} >= {"s/0", "s/1", "s/2"}
+    assert result.worst == min(result.rows, key=lambda record: record.slack)
+    assert result.solver == solver
+
+
+def test_osqp_and_daqp_agree() -> None:
+    inputs = tick(straight([(2.5, 0.1, 2.0)], [(-1.0, 0.0, 0.0)]))
+    one, other = (
+        SafetyFilter(msgspec.structs.replace(SAFETY, solver=name), LIMITS).step(inputs) for name in ("daqp", "osqp")
+    )
+    assert one.a_safe == pytest.approx(other.a_safe, abs=1e-3)
+
+
+def test_the_answer_is_near_the_cheapest_of_a_dense_search() -> None:
+    """An independent minimiser: 20 000 random accelerations judged by the definition of admissibility."""
+    inputs = tick(straight([(2.5, 0.1, 2.0)], [(-1.0, 0.0, 0.0)]))
+    result = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    rows = Barrier(SAFETY).rows(inputs.p_enu, inputs.v_enu, inputs.prediction, 0.0)
+    points = np.random.default_rng(0).uniform(-3.0, 3.0, (20_000, 3))
+    rise, psi = rows.evaluate_many(points)
+    holds = (rise + psi >= 0.0).all(axis=(-2, -1))  # epsilon at its bound, the loosest outside the keep-out distance
+    best = float(((points[holds] - inputs.a_ref) ** 2).sum(axis=-1).min())
+    found = float(((result.a_safe - inputs.a_ref) ** 2).sum())
+    assert found <= best + 0.05
+
+
+def test_a_hopeless_case_is_relaxed_and_named_and_not_the_reference() -> None:
+    inputs = tick(straight([(0.75, 0.0, 2.0), (8.0, 0.0, 2.0)], [(-3.0, 0.0, 0.0), (0.0, 0.0, 0.0)]))
+    result = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    assert result.verdict is Verdict.RELAXED
+    assert result.worst is not None
+    assert result.worst.track == "s/0"
+    assert result.worst.slack < 0.0
+    assert not np.array_equal(result.a_safe, inputs.a_ref)
+    assert np.abs(result.a_safe).max() <= 3.0
+
+
+def test_the_relaxed_answer_leaves_more_room_than_any_of_many_others() -> None:
+    inputs = tick(straight([(1.2, 0.1, 2.0)], [(-3.0, 0.0, 0.0)]), v=(3.0, 0.0, 0.0))
+    result = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    assert result.verdict is Verdict.RELAXED
+    rows = Barrier(SAFETY).rows(inputs.p_enu, inputs.v_enu, inputs.prediction, 0.0)
+    others = np.random.default_rng(1).uniform(-3.0, 3.0, (5000, 3))
+    assert search.shares(rows, result.a_safe[None])[0] >= search.shares(rows, others).max() - 1e-3
+
+
+def test_walls_are_kept_while_nobody_is_touched_and_given_up_for_a_contact() -> None:
+    """At the east wall: an obstacle that merely eats the margin does not push through it, one that hits does."""
+    beside, hit = (
+        SafetyFilter(SAFETY, LIMITS).step(
+            tick(straight([p], [v]), p=(9.999, 0.0, 5.0), v=(0.0, 0.0, 0.0), a=(0.0, 0.0, 0.0))
+        )
+        for p, v in (((9.6, 0.38, 5.0), (2.0, 0.0, 0.0)), ((9.5, 0.0, 5.0), (0.6, 0.0, 0.0)))
+    )
+    assert beside.verdict is Verdict.RELAXED
+    assert min((row.slack for row in beside.rows if row.track == "arena"), default=0.0) >= -1e-6
+    assert hit.verdict is Verdict.RELAXED
+    assert min(row.slack for row in hit.rows if row.track == "arena") < -0.1
+
+
+def test_arena_floor_and_speed_bind_without_any_obstacle() -> None:
+    nothing = straight([], [])
+    floor = SafetyFilter(SAFETY, LIMITS).step(tick(nothing, p=(0.0, 0.0, 0.35), v=(0.0, 0.0, -0.3), a=(0.0, 0.0, -2.0)))
+    assert floor.verdict is Verdict.ADJUSTED
+    assert floor.worst is not None
+    assert floor.worst.track == "floor"
+    assert floor.a_safe[2] > -2.0
+    ready = SafetyFilter(SAFETY, LIMITS).step(
+        tick(nothing, p=(0.0, 0.0, 0.0), v=(0.0, 0.0, 0.0), a=(0.0, 0.0, 0.0), limits_on=False)
+    )
+    assert ready.verdict is Verdict.NOMINAL
+    fast = SafetyFilter(SAFETY, LIMITS).step(tick(nothing, p=(-9.0, 0.0, 5.0), v=(4.2, 4.2, 0.0), a=(3.0, 0.0, 0.0)))
+    assert fast.verdict is Verdict.ADJUSTED
+    assert np.linalg.norm(np.array([4.2, 4.2, 0.0]) + 0.05 * fast.a_safe) <= 6.0 + 1e-6 * 0.05
+    assert fast.worst is not None
+    assert fast.worst.track == "speed"
+
+
+def test_outside_the_arena_the_answer_is_relaxed_and_points_back() -> None:
+    result = SafetyFilter(SAFETY, LIMITS).step(tick(straight([], []), p=(12.0, 0.0, 5.0)))
+    assert result.verdict is Verdict.RELAXED
+    assert result.worst is not None
+    assert result.worst.track == "arena"
+    assert result.a_safe[0] == pytest.approx(-3.0)
+
+
+def fly(start: tuple[float, ...], obstacle: tuple[float, ...], velocity: tuple[float, ...]) -> tuple[list[float], bool]:
+    """Euler point mass with a proportional reference to (6, 0, 2): clearances, and whether it arrived."""
+    guard, target = SafetyFilter(SAFETY, LIMITS), np.array([6.0, 0.0, 2.0])
+    p, v, o, clearances = np.array(start), np.zeros(3), np.array(obstacle), []
+    for step in range(400):
+        a_ref = np.clip(1.5 * (target - p) - 2.2 * v, -2.5, 2.5)
+        result = guard.step(
+            FilterInput(p, v, a_ref, straight([tuple(o)], [velocity]), elapsed_s=0.05 if step else None)
+        )
+        p, v, o = p + 0.05 * v, v + 0.05 * result.a_safe, o + 0.05 * np.array(velocity)
+        clearances.append(math.dist(p, o) - 0.4)
+    return clearances, math.dist(p, target) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "velocity"),
+    [
+        ((3.0, 0.0, 2.0), (0.0, 0.0, 0.0)),  # static, exactly in the way
+        ((6.0, 0.0, 2.0), (-2.0, 0.0, 0.0)),  # head-on, exactly
+        ((2.0, 0.0, 2.0), (0.4, 0.0, 0.0)),  # overtaken from exactly behind
+        ((3.0, 0.0, 6.0), (0.0, 0.0, -1.5)),  # from above
+    ],
+)
+def test_exact_symmetry_is_broken_the_same_way_every_time(
+    obstacle: tuple[float, ...], velocity: tuple[float, ...]
+) -> None:
+    first, arrived = fly((-2.0, 0.0, 2.0), obstacle, velocity)
+    second, _ = fly((-2.0, 0.0, 2.0), obstacle, velocity)
+    assert arrived
+    assert min(first) > 0.0
+    assert first == second
+
+
+def test_reset_reproduces_bit_for_bit() -> None:
+    guard = SafetyFilter(SAFETY, LIMITS)
+    ticks = [tick(straight([(3.0 - 0.05 * k, 0.05, 2.0)], [(-1.0, 0.0, 0.0)])) for k in range(6)]
+    first = [guard.step(inputs) for inputs in ticks]
+    guard.reset()
+    second = [guard.step(inputs) for inputs in ticks]
+    assert any(result.verdict is Verdict.ADJUSTED for result in first)
+    for one, other in zip(first, second, strict=True):
+        assert one.a_safe.tobytes() == other.a_safe.tobytes()
+        assert (one.rows, one.verdict, one.iterations) == (other.rows, other.verdict, other.iterations)
+
+
+def test_a_failing_solver_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(qp.BACKENDS, "daqp", lambda _: None)
+    inputs = tick(straight([(2.5, 0.1, 2.0)], [(-1.0, 0.0, 0.0)]))
+    result = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    assert result.verdict is Verdict.ADJUSTED
+    assert result.solver == "osqp"
+    assert true_slack(inputs, result) >= -1e-6
+
+
+@pytest.mark.parametrize("distance_m", [3.5, 0.75])
+def test_without_any_solver_the_vehicle_brakes(monkeypatch: pytest.MonkeyPatch, distance_m: float) -> None:
+    for name in ("daqp", "osqp"):
+        monkeypatch.setitem(qp.BACKENDS, name, lambda _: None)
+    inputs = tick(straight([(distance_m, 0.0, 2.0)], [(-1.0, 0.0, 0.0)]), a=(3.0, 0.0, 0.0))
+    result = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    assert result.verdict is Verdict.BRAKING
+    assert result.a_safe[0] < 0.0
+    assert result.worst is not None
+    if distance_m > 2.0:
+        assert true_slack(inputs, result) >= -1e-6
+
+
+def test_a_solver_that_dies_midway_leaves_the_admissible_iterate(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = iter(range(100))
+    real = qp.solve_daqp
+    monkeypatch.setitem(qp.BACKENDS, "daqp", lambda program: real(program) if next(calls) < 1 else None)
+    monkeypatch.setitem(qp.BACKENDS, "osqp", lambda _: None)
+    inputs = tick(straight([(2.5, 0.1, 2.0), (2.0, -1.0, 2.0)], [(-1.0, 0.0, 0.0)] * 2))
+    result = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    assert result.verdict is Verdict.ADJUSTED
+    assert true_slack(inputs, result) >= -1e-6
+
+
+def test_strict_pricing_follows_the_clf() -> None:
+    """At Table 1's prices an approach may not keep its epsilon: V falls by eta a tick, up to the rows' own demand."""
+    config = msgspec.structs.replace(SAFETY, lambda_epsilon=10.0, lambda_delta=1e4)
+    inputs = tick(straight([(2.5, 0.1, 2.0)], [(-1.0, 0.0, 0.0)]))
+    cheap = SafetyFilter(SAFETY, LIMITS).step(inputs)
+    strict = SafetyFilter(config, LIMITS).step(inputs)
+    assert strict.rows[0].epsilon <= cheap.rows[0].epsilon
+    assert strict.rows[0].epsilon_star == 0.0
+
+
+def test_preset_paper_is_the_letter_of_the_paper() -> None:
+    config = parse_config({"safety": {"preset": "paper"}}).safety
+    assert (config.form, config.horizon, config.kappa, config.sigma_delay_s) == ("paper", 5, 0.0, 0.0)
+    assert (config.lambda_u, config.lambda_epsilon, config.lambda_delta) == (1.0, 10.0, 1e4)
+    assert (config.alpha1, config.alpha2, config.epsilon_max) == (0.8, 0.5, 2.0)
+    result = SafetyFilter(config, LIMITS).step(tick(straight([(1.5, 0.1, 2.0)], [(-1.0, 0.0, 0.0)], horizon=5)))
+    assert result.verdict in (Verdict.ADJUSTED, Verdict.RELAXED)
+
+
+def test_a_track_that_appears_and_vanishes_has_no_lasting_effect() -> None:
+    guard = SafetyFilter(SAFETY, LIMITS)
+    far = tick(straight([(8.0, 5.0, 2.0)], [(0.0, 0.0, 0.0)]))
+    before = guard.step(far)
+    guard.step(tick(straight([(8.0, 5.0, 2.0), (1.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)] * 2)))
+    after = guard.step(far)
+    assert before.verdict is after.verdict is Verdict.NOMINAL
+    assert before.rows == after.rows
+
+
+def test_on_top_of_an_obstacle_there_is_still_an_answer() -> None:
+    result = SafetyFilter(SAFETY, LIMITS).step(
+        tick(straight([(0.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)]), v=(0.0, 0.0, 0.0), a=(0.0, 0.0, 0.0))
+    )
+    assert result.verdict is Verdict.RELAXED
+    assert np.isfinite(result.a_safe).all()
+
+
+def test_no_solver_error_leaves_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise SolverError("injected")
+
+    monkeypatch.setattr("companion.safety.filter.solve_task", broken)
+    result = SafetyFilter(SAFETY, LIMITS).step(tick(straight([(1.0, 0.0, 2.0)], [(-1.0, 0.0, 0.0)])))
+    assert result.verdict is Verdict.BRAKING

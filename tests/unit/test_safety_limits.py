@@ -1,0 +1,116 @@
+"""The vehicle's own limits: braking distances worked by hand, and a wall that is never passed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from companion.config import LimitsConfig
+from companion.safety.limits import BRAKING_SHARE, VehicleLimits, braking_speed, vehicle_limits
+
+LIMITS = LimitsConfig()
+
+
+def at(p: tuple[float, ...], v: tuple[float, ...], *, arena_on: bool = True, shrink: float = 0.0) -> VehicleLimits:
+    return vehicle_limits(np.array(p), np.array(v), LIMITS, arena_on=arena_on, shrink_m_s2=shrink, dt_s=0.05)
+
+
+def test_braking_speed_by_hand() -> None:
+    """2 m/s^2 on a 0.05 s grid: 4 m/s takes 4^2 / 4 + 4 * 0.025 = 4.1 m."""
+    assert braking_speed(np.array(4.1), 2.0, 0.05) == pytest.approx(4.0)
+    assert braking_speed(np.array(0.0), 2.0, 0.05) == pytest.approx(0.0)
+    assert braking_speed(np.array(-0.5), 2.0, 0.05) == pytest.approx(-0.5)
+
+
+def test_far_from_everything_only_the_box_is_left() -> None:
+    limits = at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), shrink=0.25)
+    assert limits.low.tolist() == [-2.75] * 3
+    assert limits.high.tolist() == [2.75] * 3
+    assert limits.admits(np.full(3, 2.75))
+    assert not limits.admits(np.array([2.76, 0.0, 0.0]))
+
+
+def test_near_a_wall_the_bound_is_the_braking_distance() -> None:
+    limits = at((9.0, 0.0, 5.0), (1.5, 0.0, 0.0))
+    distance = 10.0 - 9.0 - 0.075
+    expected = (float(braking_speed(np.array(distance), BRAKING_SHARE * 3.0, 0.05)) - 1.5) / 0.05
+    assert limits.arena_high[0] == pytest.approx(expected)
+    slacks = limits.slacks(np.array([expected, 0.0, 0.0]))
+    assert slacks["arena"] == pytest.approx(0.0, abs=1e-9)
+    assert slacks["floor"] > 3.0
+
+
+def test_floor_and_ceiling_have_their_own_names() -> None:
+    low = at((0.0, 0.0, 0.3), (0.0, 0.0, 0.0)).slacks(np.array([0.0, 0.0, -1.0]))
+    assert low["floor"] == pytest.approx(-1.0)
+    assert low["arena"] > 0.0
+    high = at((0.0, 0.0, 10.0), (0.0, 0.0, 0.0)).slacks(np.array([0.0, 0.0, 1.0]))
+    assert high["ceiling"] == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("wall", [0, 1, 2])
+def test_full_thrust_at_a_wall_stops_before_it(wall: int) -> None:
+    p, v = np.array([0.0, 0.0, 5.0]), np.zeros(3)
+    push = 3.0 * np.eye(3)[wall]
+    for _ in range(400):
+        limits = at(tuple(p), tuple(v))
+        a = limits.clip(push)
+        assert min(limits.slacks(a).values()) > -1e-9
+        p, v = p + 0.05 * v, v + 0.05 * a
+    assert LIMITS.arena_max[wall] - 0.05 < p[wall] <= LIMITS.arena_max[wall] + 1e-9
+    assert abs(v[wall]) < 1e-3
+
+
+def test_outside_the_arena_no_limit_is_admitted_until_the_vehicle_returns() -> None:
+    limits = at((12.0, 0.0, 5.0), (1.0, 0.0, 0.0))
+    assert limits.high[0] == -3.0  # all that the box has
+    assert not limits.admits(np.array([-3.0, 0.0, 0.0]))
+    assert limits.slacks(np.array([-3.0, 0.0, 0.0]))["arena"] < 0.0
+    below = at((-12.0, 0.0, 5.0), (0.0, 0.0, 0.0))
+    assert not below.admits(np.array([3.0, 0.0, 0.0]))
+
+
+def test_arena_off_leaves_the_box() -> None:
+    limits = at((12.0, 0.0, 0.0), (0.0, 0.0, 0.0), arena_on=False)
+    assert limits.admits(np.array([1.0, 0.0, -1.0]))
+
+
+def test_an_arena_narrower_than_a_braking_distance_leaves_one_answer() -> None:
+    tight = LimitsConfig(arena_min=(-0.01, -10.0, 0.3), arena_max=(0.01, 10.0, 10.0))
+    limits = vehicle_limits(
+        np.array([0.0, 0.0, 5.0]), np.array([0.5, 0.0, 0.0]), tight, arena_on=True, shrink_m_s2=0.0, dt_s=0.05
+    )
+    assert (limits.low <= limits.high).all()
+
+
+def test_speed_limit_is_the_norm_after_the_step() -> None:
+    limits = at((0.0, 0.0, 5.0), (5.9, 0.0, 0.0))
+    assert limits.slacks(np.array([1.0, 0.0, 0.0]))["speed"] == pytest.approx(1.0)
+    assert limits.admits(np.array([1.9, 0.0, 0.0]))
+    assert not limits.admits(np.array([2.1, 0.0, 0.0]))
+    assert limits.slow(np.array([[2.1, 0.0, 0.0], [0.0, 0.0, 0.0]])) == pytest.approx([0.1, 0.0])
+
+
+def test_above_the_speed_limit_half_the_box_must_slow_down() -> None:
+    limits = at((0.0, 0.0, 5.0), (6.5, 0.0, 0.0), arena_on=False)
+    assert limits.speed_bound_m_s == pytest.approx(6.5 - 0.5 * 3.0 * 0.05)
+    assert limits.admits(np.array([-1.5001, 0.0, 0.0]))
+    assert not limits.admits(np.array([-1.4, 0.0, 0.0]))
+
+
+def test_speed_row_is_the_tangent_of_the_limit() -> None:
+    limits = at((0.0, 0.0, 5.0), (5.0, 2.0, 0.0))
+    a, step = np.array([1.0, -0.5, 0.3]), 1e-5
+    normal, floor = limits.speed_row(a)
+    slack = limits.slacks(a)["speed"]
+    assert normal @ a - floor == pytest.approx(slack)
+    for axis in range(3):
+        shift = step * np.eye(3)[axis]
+        difference = (limits.slacks(a + shift)["speed"] - limits.slacks(a - shift)["speed"]) / (2 * step)
+        assert normal[axis] == pytest.approx(difference, abs=1e-6)
+
+
+def test_speed_row_of_a_vehicle_at_rest_asks_nothing() -> None:
+    normal, floor = at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0)).speed_row(np.zeros(3))
+    assert normal.tolist() == [0.0, 0.0, 0.0]
+    assert floor < 0.0
