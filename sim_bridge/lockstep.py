@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from sim_bridge.errors import SimError
 from sim_bridge.mavlink import Packet
-from sim_bridge.messages import Cmd, Command, Mode
+from sim_bridge.messages import Cmd, Command
 from sim_bridge.placement import step_command
 from sim_bridge.scenario import OperatorStep
 
@@ -134,5 +134,5 @@ def _belongs(step: OperatorStep, command: Command) -> bool:
     if command.command != number or command.target_component not in ({1: (0, 1)}.get(component, (component,))):
         return False
     if number == Cmd.DO_SET_MODE:
-        return int(command.params[1]) << 16 | int(command.params[2]) << 24 == Mode.HOLD
+        return command.params[1:3] == (4.0, 3.0)  # PX4's AUTO.LOITER
     return param1 is None or command.params[0] == param1

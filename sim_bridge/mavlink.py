@@ -74,6 +74,8 @@ class Decoder:
             message = self._mav.decode(bytearray(raw))
         except (dialect.MAVError, struct.error, ValueError):
             return None
+        if isinstance(message, dialect.MAVLink_unknown):
+            return None  # without its CRC_EXTRA nobody can tell it from rubbish
         sender = Sender(raw[5], raw[6]) if raw[0] == _V2 else Sender(raw[3], raw[4])
         target = Sender(getattr(message, "target_system", 0), getattr(message, "target_component", 0))
         read = _READERS.get(message.get_type())
@@ -181,8 +183,8 @@ class Encoder:
         return self.pack(dialect.MAVLink_statustext_message(int(text.severity), text.text.encode()[:50]))
 
     def timesync(self, request: Timesync, now_ns: int) -> bytes:
-        to = request.sender
-        return self.pack(dialect.MAVLink_timesync_message(now_ns, request.ts1, to.system, to.component))
+        """The answer; pymavlink's dialect has no target fields here, so whoever sent ``ts1`` knows it by that."""
+        return self.pack(dialect.MAVLink_timesync_message(now_ns, request.ts1))
 
     def param(self, name: str, value: float | int, index: int, count: int) -> bytes:
         if isinstance(value, int):

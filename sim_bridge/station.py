@@ -133,7 +133,7 @@ class Station:
         streams = self._streams[link]
         message_id = int(command.params[0]) if abs(command.params[0]) < 1 << 24 else -1
         if command.command == Cmd.SET_MESSAGE_INTERVAL:
-            granted = streams.request(message_id, command.params[1])
+            granted = streams.request(message_id, command.params[1], self._flight.t_ns)
         elif command.command == Cmd.GET_MESSAGE_INTERVAL:
             link.send(link.encoder.message_interval(message_id & 0xFFFF, streams.interval_us(message_id)))
             granted = message_id in BUILDERS

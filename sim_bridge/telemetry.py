@@ -203,8 +203,8 @@ class Streams:
         """MESSAGE_INTERVAL's value: microseconds, -1 off, 0 for a message that does not exist here."""
         return self._interval_us.get(message_id, 0)
 
-    def request(self, message_id: int, interval_us: float) -> bool:
-        """SET_MESSAGE_INTERVAL: microseconds, -1 off, 0 the default rate; False where that cannot be had."""
+    def request(self, message_id: int, interval_us: float, t_ns: int) -> bool:
+        """SET_MESSAGE_INTERVAL at ``t_ns``: microseconds, -1 off, 0 the default rate; False where it cannot be had."""
         if message_id not in BUILDERS or not math.isfinite(interval_us):
             return False
         if interval_us > 0 and interval_us < self._min_us * 0.999:
@@ -213,7 +213,8 @@ class Streams:
             return True
         default_us = self._defaults_us.get(message_id, -1)
         self._interval_us[message_id] = default_us if interval_us == 0 else max(-1, round(interval_us))
-        self._due_ns[message_id] = self._next_ns = 0
+        self._schedule(message_id, t_ns)
+        self._next_ns = min(self._next_ns, self._due_ns[message_id])
         return True
 
     def due(self, t_ns: int) -> list[int]:
@@ -225,10 +226,14 @@ class Streams:
             if interval_us < 0 or t_ns < self._due_ns[message_id]:
                 continue
             ready.append(message_id)
-            interval_ns = max(1, interval_us) * 1000
-            self._due_ns[message_id] = (t_ns // interval_ns + 1) * interval_ns
+            self._schedule(message_id, t_ns)
         self._next_ns = min(due for i, due in self._due_ns.items() if self._interval_us[i] >= 0)
         return ready
+
+    def _schedule(self, message_id: int, t_ns: int) -> None:
+        """Due at the next multiple of its interval."""
+        interval_ns = max(1, self._interval_us[message_id]) * 1000
+        self._due_ns[message_id] = (t_ns // interval_ns + 1) * interval_ns
 
 
 def build(message_id: int, now: Moment, encoder: Encoder) -> bytes:

@@ -1,0 +1,201 @@
+"""Scenario files: what is refused and how it is said, and what a seed makes of one."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sim_bridge.cli import main
+from sim_bridge.errors import ScenarioError
+from sim_bridge.obstacles import Accelerated, FigureEight, Linear, Static
+from sim_bridge.placement import describe, resolve
+from sim_bridge.scenario import Scenario, load_scenario, parse_scenario
+
+LINEAR = {"id": "a", "motion": "linear", "cross_point": [1.0, 2.0, 3.0], "cross_at_s": 2.0, "velocity": [1.0, 0.0, 0.5]}
+EIGHT = {"id": "e", "motion": "figure_eight", "origin": [0.0, 0.0, 2.0], "size_m": 2.0, "period_s": 8.0}
+
+
+def parsed(**changes: Any) -> Scenario:
+    return parse_scenario(changes, source="test.toml")
+
+
+@pytest.mark.parametrize("name", ["demo", "linear", "accelerated", "empty"])
+def test_shipped_scenarios_resolve(name: str) -> None:
+    stem, scenario = load_scenario(name)
+    resolved = resolve(stem, scenario, 5)
+    assert resolved.name == name
+    assert len(resolved.obstacles) == len(scenario.obstacles)
+    assert resolved.control_steps == 12
+    assert resolved.period_ns == 50_000_000
+    for obstacle in resolved.obstacles:
+        # at the start nothing is near the vehicle, nothing is outside the arena
+        p = obstacle.motion.position(0.0)
+        assert all(abs(x) < 10.0 for x in p[:2])
+        assert math.dist(p, (*scenario.vehicle.start[:2], scenario.vehicle.takeoff_altitude_m)) > 1.0
+
+
+def test_the_demo_is_what_it_says() -> None:
+    _, scenario = load_scenario("demo")
+    resolved = resolve("demo", scenario, 0)
+    assert scenario.target is not None
+    assert 10.0 <= math.dist(scenario.vehicle.start[:2], scenario.target.position[:2]) <= 12.0
+    motions = [o.motion for o in resolved.obstacles]
+    assert len(motions) == 3
+    assert all(isinstance(m, FigureEight) for m in motions)
+    for motion, obstacle in zip(motions, scenario.obstacles, strict=True):
+        assert obstacle.cross_at_s is not None
+        fastest = max(math.hypot(*motion.velocity(0.05 * k)) for k in range(240))
+        assert 1.2 <= fastest <= 1.8
+        lowest = min(motion.position(0.05 * k)[2] for k in range(240))
+        assert lowest - obstacle.radius_m > 0.3
+    (sensor,) = scenario.sensors
+    assert (sensor.sigma_m, sensor.latency_s, sensor.dropout, sensor.rate_hz) == (0.05, 0.05, 0.05, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"typo": 1}, "typo"),
+        ({"vehicle": {"typo": 1}}, "vehicle"),
+        ({"physics_hz": 250}, "physics_hz"),
+        ({"control_hz": 30, "physics_hz": 240}, "control_hz"),
+        ({"physics_hz": 0}, "physics_hz"),
+        ({"vehicle": {"start": [0.0, 0.0]}}, "vehicle.start"),
+        ({"vehicle": {"start": [0.0, math.nan, 1.0]}}, "vehicle.start"),
+        ({"vehicle": {"takeoff_altitude_m": 0.1}}, "vehicle.takeoff_altitude_m"),
+        ({"target": {"position": [1e5, 0.0, 1.0]}}, "target.position"),
+        ({"sensors": [{"dropout": 1.5}]}, "sensors[0].dropout"),
+        ({"sensors": [{"rate_hz": 0.0}]}, "sensors[0].rate_hz"),
+        ({"sensors": [{"source": "a/b"}]}, "sensors[0].source"),
+        ({"sensors": [{}, {}]}, "sensors"),
+        ({"obstacles": [{**LINEAR, "motion": "zigzag"}]}, "obstacles[0]"),
+        ({"obstacles": [{**LINEAR, "radius_m": 0.0}]}, "obstacles[0].radius_m"),
+        ({"obstacles": [LINEAR, LINEAR]}, "a twice"),
+        ({"obstacles": [{**LINEAR, "origin": [0.0, 0.0, 0.0]}]}, "exactly one of origin and cross_point"),
+        ({"obstacles": [{k: v for k, v in LINEAR.items() if k != "cross_at_s"}]}, "cross_at_s"),
+        ({"obstacles": [{**EIGHT, "cross_at_s": 1.0}]}, "cross_at_s"),
+        ({"obstacles": [{k: v for k, v in LINEAR.items() if k != "velocity"}]}, "velocity"),
+        ({"operator": [{"do": "arm"}]}, "operator[0]"),
+        ({"operator": [{"do": "arm", "at_tick": 1, "after": "airborne_hover"}]}, "operator[0]"),
+        ({"operator": [{"do": "dance", "at_tick": 1}]}, "operator[0].do"),
+        ({"end": {"timeout_s": -1.0}}, "end.timeout_s"),
+    ],
+)
+def test_refusals_are_one_line_that_names_file_and_key(changes: dict[str, Any], named: str) -> None:
+    with pytest.raises(ScenarioError) as refusal:
+        parsed(**changes)
+    text = str(refusal.value)
+    assert text.startswith("test.toml: ")
+    assert named in text
+    assert "\n" not in text
+
+
+def test_files_that_are_not_there_or_not_toml(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"one of accelerated, demo, empty, linear"):
+        load_scenario("no-such")
+    with pytest.raises(ScenarioError, match="cannot be read"):
+        load_scenario(str(tmp_path / "none.toml"))
+    bad = tmp_path / "bad.toml"
+    bad.write_text("x = ")
+    with pytest.raises(ScenarioError, match=r"bad\.toml: not TOML"):
+        load_scenario(str(bad))
+
+
+def test_every_motion_passes_its_crossing_point_in_time() -> None:
+    crossing = {"cross_point": [1.0, 2.0, 3.0], "cross_at_s": 2.0}
+    eight = {k: v for k, v in EIGHT.items() if k != "origin"} | crossing
+    scenario = parsed(
+        obstacles=[
+            LINEAR,
+            {"id": "b", "motion": "accelerated", "velocity": [1, 0, 0], "acceleration": [0, -1, 0.25], **crossing},
+            {**eight, "id": "c", "tilt_deg": 30.0},
+            {**eight, "id": "d", "cross_phase_deg": 90.0},
+            {"id": "f", "motion": "static", **crossing},
+        ]
+    )
+    motions = [o.motion for o in resolve("x", scenario, 0).obstacles]
+    assert [type(m) for m in motions] == [Linear, Accelerated, FigureEight, FigureEight, Static]
+    for motion in motions:
+        assert motion.position(2.0) == pytest.approx((1.0, 2.0, 3.0), abs=1e-12)
+    assert isinstance(motions[2], FigureEight)
+    assert motions[2].center_enu == pytest.approx((1.0, 2.0, 3.0))  # crosses at its centre
+    assert isinstance(motions[3], FigureEight)
+    assert motions[3].center_enu != pytest.approx((1.0, 2.0, 3.0), abs=0.5)
+
+
+def test_jitter_stays_within_its_bounds_and_belongs_to_the_seed() -> None:
+    jitter = {"position_m": [0.5, 0.0, 0.1], "time_s": 0.2, "yaw_deg": 30.0}
+    scenario = parsed(obstacles=[{**LINEAR, "jitter": jitter}, {**LINEAR, "id": "b"}])
+    headings, xs = [], []
+    for seed in range(300):
+        moving, fixed = (o.motion for o in resolve("x", scenario, seed).obstacles)
+        assert isinstance(moving, Linear)
+        assert fixed == Linear((-1.0, 2.0, 2.0), (1.0, 0.0, 0.5))
+        assert resolve("x", scenario, seed).obstacles[0].motion == moving
+        vx, vy, vz = moving.v_enu
+        assert math.hypot(vx, vy) == pytest.approx(1.0)
+        assert vz == 0.5
+        headings.append(math.degrees(math.atan2(vy, vx)))
+        # the time at which y = 2 is where the crossing point is passed, whatever the heading
+        z_shift = moving.p0_enu[2] - 2.0
+        assert abs(z_shift) <= 0.1 + 0.2 * 0.5 + 1e-9
+        xs.append(moving.position(2.0)[0])
+    assert -30.0 <= min(headings) < -25.0
+    assert 25.0 < max(headings) <= 30.0
+    assert max(abs(x - 1.0) for x in xs) <= 0.7 + 1e-9
+    assert max(abs(x - 1.0) for x in xs) > 0.5
+
+
+def test_without_obstacles_and_description() -> None:
+    _, scenario = load_scenario("demo")
+    assert resolve("demo", scenario, 1, obstacles=False).obstacles == ()
+    told = describe(resolve("demo", scenario, 1), "uav7")
+    assert told["prefix"] == "uav/uav7"
+    assert told["target"] == (5.5, 0.0, 1.5)
+    assert told["sources"] == ["sim"]
+    assert [step["do"] for step in told["operator"]] == ["arm", "takeoff", "engage"]
+    assert told["obstacles"] != describe(resolve("demo", scenario, 2), "uav7")["obstacles"]
+
+
+def test_sensor_draws_do_not_depend_on_the_obstacles() -> None:
+    _, scenario = load_scenario("demo")
+    with_them, without = (resolve("demo", scenario, 4, obstacles=o) for o in (True, False))
+    assert with_them.sensor_rng(0).random() == without.sensor_rng(0).random()
+    assert with_them.sensor_rng(0).random() != with_them.sensor_rng(1).random()
+
+
+def test_command_line_prints_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenario", "linear", "--seed", "3", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["seed"] == 3
+    assert told["obstacles"][0]["motion"] == "Linear"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["run", "--scenario", "no-such"], "no-such"),
+        (["run", "--lockstep", "--zenoh-listen", "none"], "--zenoh-listen"),
+        (["run", "--onboard-port", "4000", "--gcs-port", "4000"], "4000"),
+        (["run", "--scenario", "empty", "--zenoh-listen", "none", "--trace", "/no/such/place"], "/no/such/place"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_status_2(
+    arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1
+    assert named in told.err
+
+
+@pytest.mark.parametrize("arguments", [["run", "--seed", "-1"], ["run", "--gcs-port", "0"], []])
+def test_argparse_refuses_with_status_2(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as done:
+        main(arguments)
+    assert done.value.code == 2
