@@ -36,8 +36,11 @@ from companion.types import FloatArray, Vec3
 
 RING_POINTS = 8
 SETTLED_M_S2 = 1e-3  # iterates closer than this have converged: the answer is admissible either way
+SETTLED = 0.01  # so has a sequence whose last program saved less than this share of the cost
 INSET_M_S2 = 1e-7  # tangents are kept by this much, so that the solver's tolerance stays inside the rows
 SHARE_WEIGHT = 1e4  # cost of the whole margin, against |a - a_ref|^2 in (m/s^2)^2
+LEAVE_WEIGHT = 1e2  # the same at the end of the horizon: a vehicle inside the margin leaves it
+KEEP_WAY = 0.15  # share of the margin that another way round must offer before the last answer's is left
 _STEPS = np.array([[1.0], [0.5], [0.25], [0.1]])  # shares of a program's step that are judged
 _LATTICE = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0, -1, 1)], dtype=np.float64)
 
@@ -134,17 +137,18 @@ def least_cost(task: Task, start: Found, order: tuple[str, ...]) -> Found:
     """The best admissible iterate of a sequence of programs from ``start``; ``start`` itself if none is better.
 
     Raises:
-        SolverError: no solver works; that a program about an inadmissible start is infeasible is no such failure.
+        SolverError: no solver answers a program about an admissible start. About an inadmissible one there may be
+            no answer, which is no failure.
     """
     best, a, epsilon = start, start.a, start.epsilon
     for count in range(1, task.config.iterations + 1):
         try:
             x, solver = solve(_tangent_program(task, a, epsilon), order)
         except SolverError as error:
-            if best.iterations or isinstance(error, Infeasible):
-                break
-            raise
-        previous = a
+            if start.admissible and not best.iterations and not isinstance(error, Infeasible):
+                raise
+            break
+        previous, before = a, best.cost
         tried = task.limits.clip(a + _STEPS * (x[:3] - a))
         verdict = judge(task, tried)
         taken = int(np.where(verdict.admissible, verdict.cost, np.inf).argmin())
@@ -152,7 +156,9 @@ def least_cost(task: Task, start: Found, order: tuple[str, ...]) -> Found:
         epsilon = np.minimum(np.maximum(task.star, verdict.lower[taken]), verdict.upper[taken])
         if verdict.admissible[taken] and verdict.cost[taken] < best.cost:
             best = Found(a, epsilon, True, float(verdict.cost[taken]), count, solver)
-        if best.admissible and float(np.abs(a - previous).max()) < SETTLED_M_S2:
+        if best.admissible and (
+            before - best.cost < SETTLED * best.cost or float(np.abs(a - previous).max()) < SETTLED_M_S2
+        ):
             break
     return best
 
@@ -222,7 +228,9 @@ def least_violation(task: Task, starts: FloatArray, order: tuple[str, ...]) -> F
 
 
 def _widest(task: Task, starts: FloatArray, low: Vec3, high: Vec3, order: tuple[str, ...]) -> Found:
-    a = starts[int(shares(task.rows, starts).argmax())]
+    offered = shares(task.rows, starts) - task.limits.slow(starts)
+    offered[0] += KEEP_WAY
+    a = starts[int(offered.argmax())]
     for count in range(1, task.config.iterations + 1):  # noqa: B007
         x, solver = solve(_share_program(task, a, low, high), order)
         previous, a = a, np.clip(x[:3], low, high)
@@ -234,25 +242,26 @@ def _widest(task: Task, starts: FloatArray, low: Vec3, high: Vec3, order: tuple[
 
 
 def _share_program(task: Task, a: Vec3, low: Vec3, high: Vec3) -> Program:
-    """Variables a, t and the speed limit's slack: |r_k| by its tangent at ``a`` >= R + t (D - R)."""
+    """Variables a, t, t at the horizon's end, the speed limit's slack: |r_k|'s tangent at ``a`` >= R + t (D - R)."""
     rows = task.rows
     r = rows.positions(a)
     distance = np.maximum(np.sqrt((r * r).sum(axis=-1)), 1e-9)
     reach = rows.reach[2:]
     normal = r * (reach[:, None] / distance[..., None])
     floor = (normal @ a) - distance + rows.radii_m[:, None]
-    tangents = np.zeros((floor.size + 1, 5))
-    tangents[:-1, :3] = normal.reshape(-1, 3)
-    tangents[:-1, 3] = -_margins(rows).reshape(-1)
+    margins, every = _margins(rows), floor.size
+    tangents = np.zeros((every + len(rows) + 1, 6))
     floors = np.empty(len(tangents))
-    floors[:-1] = floor.reshape(-1)
+    tangents[:every, :3], tangents[every:-1, :3] = normal.reshape(-1, 3), normal[:, -1]
+    tangents[:every, 3], tangents[every:-1, 4] = -margins.reshape(-1), -margins[:, -1]
+    floors[:every], floors[every:-1] = floor.reshape(-1), floor[:, -1]
     tangents[-1, :3], floors[-1] = task.limits.speed_row(a)
-    tangents[-1, 4] = 1.0
+    tangents[-1, 5] = 1.0
     return Program(
-        weight=np.array([2.0, 2.0, 2.0, 2.0, 20.0]),
-        linear=np.array([*(-2.0 * task.a_ref), -SHARE_WEIGHT, 0.0]),
-        low=np.array([*low, -UNBOUNDED, 0.0]),
-        high=np.array([*high, 1.0, UNBOUNDED]),
+        weight=np.array([2.0, 2.0, 2.0, 2.0, 2.0, 20.0]),
+        linear=np.array([*(-2.0 * task.a_ref), -SHARE_WEIGHT, -LEAVE_WEIGHT, 0.0]),
+        low=np.array([*low, -UNBOUNDED, -UNBOUNDED, 0.0]),
+        high=np.array([*high, 1.0, 1.0, UNBOUNDED]),
         rows=tangents,
         floor=floors,
     )
@@ -261,22 +270,34 @@ def _share_program(task: Task, a: Vec3, low: Vec3, high: Vec3) -> Program:
 def solve_task(task: Task, last: Vec3 | None, order: tuple[str, ...]) -> Found:
     """Least cost where the true rows can hold, least violation where not.
 
+    The way round an obstacle taken in the last tick is kept as long as the rows still leave it open and no candidate
+    is cheaper than what it leads to: noise in the prediction must not throw the vehicle from side to side.
+
     Raises:
         SolverError: no solver works; `braking` needs none.
     """
     starts = candidates(task, last)
     judgement = judge(task, starts)
     ranked = np.where(judgement.admissible, judgement.cost, np.inf)
+    found = least_cost(task, _start(task, starts, judgement, 0), order)
     first = int(ranked.argmin())
-    admissible = bool(judgement.admissible[first])
-    if not admissible:
-        first = int((shares(task.rows, starts) - task.limits.slow(starts)).argmax())
-    epsilon = np.minimum(np.maximum(task.star, judgement.lower[first]), judgement.upper[first])
-    start = Found(
-        starts[first], np.clip(epsilon, 0.0, 1.0 / task.config.alpha2), admissible, float(ranked[first]), 0, ""
-    )
-    found = least_cost(task, start, order)
+    if ranked[first] < found.cost:
+        other = least_cost(task, _start(task, starts, judgement, first), order)
+        found = other if other.cost < found.cost else found
     return found if found.admissible else least_violation(task, starts, order)
+
+
+def _start(task: Task, starts: FloatArray, judgement: Judgement, index: int) -> Found:
+    admissible = bool(judgement.admissible[index])
+    epsilon = np.minimum(np.maximum(task.star, judgement.lower[index]), judgement.upper[index])
+    return Found(
+        a=starts[index],
+        epsilon=np.clip(epsilon, 0.0, 1.0 / task.config.alpha2),
+        admissible=admissible,
+        cost=float(judgement.cost[index]) if admissible else math.inf,
+        iterations=0,
+        solver="none",
+    )
 
 
 def braking(task: Task, last: Vec3 | None) -> Found:

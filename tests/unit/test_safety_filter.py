@@ -258,7 +258,7 @@ def test_without_any_solver_the_vehicle_brakes(monkeypatch: pytest.MonkeyPatch, 
 def test_a_solver_that_dies_midway_leaves_the_admissible_iterate(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(range(100))
     real = qp.solve_daqp
-    monkeypatch.setitem(qp.BACKENDS, "daqp", lambda program: real(program) if next(calls) < 1 else None)
+    monkeypatch.setitem(qp.BACKENDS, "daqp", lambda program: real(program) if next(calls) < 2 else None)
     monkeypatch.setitem(qp.BACKENDS, "osqp", lambda _: None)
     inputs = tick(straight([(2.5, 0.1, 2.0), (2.0, -1.0, 2.0)], [(-1.0, 0.0, 0.0)] * 2))
     result = SafetyFilter(SAFETY, LIMITS).step(inputs)
