@@ -28,15 +28,9 @@ from sim_bridge.messages import (
 )
 from sim_bridge.parameters import Parameters
 from sim_bridge.physics import BodyState
+from sim_bridge.setpoints import VELOCITY_IGNORED, YAW_IGNORED, YAW_RATE_IGNORED, refusal
 
 HOME_ALTITUDE_AMSL_M = 488.0  # PX4 SITL's home, Zurich
-FRAME_LOCAL_NED = 1
-FORCE_BIT = 0x0200
-YAW_IGNORED = 0x0400
-YAW_RATE_IGNORED = 0x0800
-VELOCITY_IGNORED = 0x0038
-MASKS = (0x0C3F, 0x083F, 0x043F, 0x0C07)  # acceleration; with yaw; with yaw rate; with velocity
-
 STREAM_GAP_NS = NS_PER_S // 2  # 2 Hz
 STREAM_NS = 450_000_000  # half a second of stream, less one period of 20 Hz for jitter
 LANDED_NS = NS_PER_S // 2  # at rest on the ground for this long
@@ -95,7 +89,7 @@ class Autopilot:
 
     def setpoint(self, setpoint: LocalSetpoint, t_ns: int) -> tuple[Reply, ...]:
         """Take an external setpoint; one that cannot be flown is dropped whole and does not count as stream."""
-        reason = _refusal(setpoint)
+        reason = refusal(setpoint)
         if reason:
             if self._refused_ns is not None and t_ns - self._refused_ns < NS_PER_S:
                 return ()
@@ -200,10 +194,7 @@ class Autopilot:
         return Result.ACCEPTED, ""
 
     def _land(self, command: Command, state: BodyState, t_ns: int) -> tuple[Result, str]:
-        x, y, _ = state.p_enu
-        below = (x, y, self.home_enu[2] - 10.0)  # never reached: descends at the speed limit until it stands
-        speed_m_s = float(self.parameters["MPC_LAND_SPEED"])
-        self._enter(Mode.LAND, PositionSetpoint(below, self._yaw_rad, v_max_m_s=speed_m_s))
+        self._descend(state)
         return Result.ACCEPTED, ""
 
     def _set_mode(self, command: Command, state: BodyState, t_ns: int) -> tuple[Result, str]:
@@ -231,6 +222,12 @@ class Autopilot:
         self.mode = Mode.OFFBOARD
         return Result.ACCEPTED, ""
 
+    def _descend(self, state: BodyState) -> None:
+        x, y, _ = state.p_enu
+        below = (x, y, self.home_enu[2] - 10.0)  # never reached: descends at the speed limit until it stands
+        speed_m_s = float(self.parameters["MPC_LAND_SPEED"])
+        self._enter(Mode.LAND, PositionSetpoint(below, self._yaw_rad, v_max_m_s=speed_m_s))
+
     def _enter(self, mode: Mode, goal: PositionSetpoint) -> None:
         self.mode = mode
         self._goal = goal
@@ -245,11 +242,7 @@ class Autopilot:
 
     def _lose_offboard(self, state: BodyState) -> Reply:
         if self.parameters["COM_OBL_RC_ACT"] == 4:
-            speed_m_s = float(self.parameters["MPC_LAND_SPEED"])
-            x, y, _ = state.p_enu
-            self._enter(
-                Mode.LAND, PositionSetpoint((x, y, self.home_enu[2] - 10.0), self._yaw_rad, v_max_m_s=speed_m_s)
-            )
+            self._descend(state)
             return Text(Severity.CRITICAL, "Failsafe: offboard setpoints lost, landing")
         self.hold(state.p_enu)
         return Text(Severity.CRITICAL, "Failsafe: offboard setpoints lost, holding")
@@ -319,22 +312,3 @@ class Autopilot:
 def _takeoff_to_default(command: Command) -> Command:
     """A takeoff to MIS_TAKEOFF_ALT out of a request for the takeoff mode."""
     return Command(Cmd.NAV_TAKEOFF, (math.nan,) * 7, command.sender)
-
-
-def _refusal(setpoint: LocalSetpoint) -> str:
-    """Why a setpoint cannot be flown, or nothing."""
-    mask = setpoint.type_mask
-    if mask & FORCE_BIT:
-        return f"type_mask 0x{mask:04X} FORCE"
-    if mask not in MASKS:
-        return f"type_mask 0x{mask:04X}"
-    if setpoint.frame != FRAME_LOCAL_NED:
-        return f"frame {setpoint.frame}"
-    used = list(setpoint.a_enu)
-    if not mask & VELOCITY_IGNORED:
-        used += setpoint.v_enu
-    if not mask & YAW_IGNORED:
-        used.append(setpoint.yaw_rad)
-    if not mask & YAW_RATE_IGNORED:
-        used.append(setpoint.yaw_rate_rad_s)
-    return "" if all(map(math.isfinite, used)) else "not a finite number"

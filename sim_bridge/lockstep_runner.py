@@ -7,6 +7,7 @@ control period of physics. Timeouts count vehicle time, but for the guards of wa
 
 from __future__ import annotations
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -22,11 +23,13 @@ from sim_bridge.messages import NS_PER_S, Ack, Command, Mode
 from sim_bridge.runner import Trace, Wires, due_frames, outcome
 from sim_bridge.scenario import OperatorStep
 from sim_bridge.station import Station
+from sim_bridge.telemetry import ALIVE, HEARTBEAT
 
 ANSWER_S = 1.0  # wall time without progress of the companion
 PRESENCE_S = 30.0  # wall time until the companion is there
 OPERATOR_S = 30.0  # wall time until the operator's command is there
-_ALIVE_S = 1.0  # heartbeats in wall time while time is held
+_ONBOARD_ALIVE_S = 1.0  # heartbeats in wall time while time is held
+_GROUND_ALIVE_S = 0.25  # and the ground station's telemetry, so that it finds us healthy soon
 _POLL_S = 0.02
 
 
@@ -50,7 +53,7 @@ class Lockstep:
         self._stopped = False
         self._ends = flight.resolved.scenario.end.stop and not stay
         self._held_s = 0.0
-        self._alive_at = 0.0
+        self._alive_at = [-math.inf, -math.inf]  # onboard, ground
         self._costs_ms: defaultdict[str, list[float]] = defaultdict(list)
         self._offboard_wall: float | None = None
 
@@ -148,11 +151,18 @@ class Lockstep:
             now = time.monotonic()
             if now >= deadline:
                 raise LockstepStalled(f"lockstep: after {limit_s:g} s: {missing()} (held at {self.flight.t_ns} ns)")
-            if now - self._alive_at >= _ALIVE_S:
-                self._alive_at = now
-                self._station.stay_alive()
+            self._stay_alive(now)
             self._wires.wait(_POLL_S)
             self._receive()
+
+    def _stay_alive(self, now: float) -> None:
+        onboard_at, ground_at = self._alive_at
+        if now - onboard_at >= _ONBOARD_ALIVE_S:
+            self._alive_at[0] = now
+            self._station.stay_alive(self._wires.router.onboard, (HEARTBEAT,))
+        if now - ground_at >= _GROUND_ALIVE_S:
+            self._alive_at[1] = now
+            self._station.stay_alive(self._wires.router.ground, ALIVE)
 
     def _receive(self) -> None:
         for record in self._bridge.records():

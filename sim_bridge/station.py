@@ -21,7 +21,6 @@ from sim_bridge.messages import (
 )
 from sim_bridge.parameters import NAMES
 from sim_bridge.telemetry import (
-    ALIVE,
     ATTITUDE_QUATERNION,
     BUILDERS,
     EXTENDED_SYS_STATE,
@@ -106,12 +105,11 @@ class Station:
                 now = self._moment()
                 link.send(b"".join(build(message_id, now, link.encoder) for message_id in due))
 
-    def stay_alive(self) -> None:
-        """While time is held: a heartbeat on both links, and what tells the ground station that we are healthy."""
+    def stay_alive(self, link: Link, message_ids: tuple[int, ...]) -> None:
+        """Messages off their schedule, while time is held."""
         now = self._moment()
-        self._send_one(self._router.onboard, HEARTBEAT, now)
-        for message_id in ALIVE:
-            self._send_one(self._router.ground, message_id, now)
+        for message_id in message_ids:
+            self._send_one(link, message_id, now)
 
     def send(self, message_id: int) -> None:
         """One message now, on both links."""
