@@ -1,0 +1,160 @@
+"""PPO on the point mass: stable-baselines3's algorithm, our environment and network; the reward is (9)-(13).
+
+Everything that decides the outcome is in `TrainConfig` and `EnvConfig`: the same two give the same weights on the same
+machine and versions.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+
+from policies.checkpoint import restore_checkpoint, save_checkpoint
+from policies.env import PRESETS, EnvConfig
+from policies.network import AxisSharedNet, AxisSharedPolicy
+from policies.views import PointMassVecEnv
+
+
+@dataclass(frozen=True, slots=True)
+class TrainConfig:
+    """Hyperparameters of PPO. ``steps`` counts environment steps over all vehicles."""
+
+    seed: int = 0
+    steps: int = 360_000
+    vehicles: int = 128
+    rollout: int = 32  # steps of each vehicle between updates
+    batch: int = 512
+    epochs: int = 4
+    learning_rate: float = 2e-3  # falls linearly to a twentieth
+    gamma: float = 0.985  # the reward's only urgency: (13) is worth 0.005 a step, a late arrival 1.5 % of 100
+    gae_lambda: float = 0.95
+    log_std: float = -1.0  # of the exploration at the start
+    reward_scale: float = 0.05  # keeps the critic's loss and the actor's of one size; returns are shown unscaled
+    actor_width: int = 32
+    critic_width: int = 48
+    threads: int = 1
+    checkpoints: int = 4  # evenly over the run
+
+
+TRAIN_PRESETS: dict[str, TrainConfig] = {
+    "default": TrainConfig(),
+    "paper": TrainConfig(steps=700_000, gamma=0.99),  # a third of the acceleration: longer flights
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CurvePoint:
+    """Where training stood after a rollout; means over the last 500 episodes, exploration noise included."""
+
+    steps: int
+    seconds: float
+    mean_return: float  # NaN until the first episode ends
+    success: float
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """The outcome: weights of the actor (normaliser included), and how it got there."""
+
+    weights: dict[str, npt.NDArray[np.float32]]
+    curve: tuple[CurvePoint, ...]
+    seconds: float
+
+    @property
+    def to_99(self) -> CurvePoint | None:
+        """The first point at which 99 % of the last 500 episodes reached the target."""
+        return next((point for point in self.curve if point.success >= 0.99), None)
+
+
+class CurveRecorder(BaseCallback):
+    """Notes a point after each rollout, hands it on, and writes checkpoints."""
+
+    def __init__(self, every_steps: int, folder: Path | None, on_point: Callable[[CurvePoint], None]) -> None:
+        super().__init__()
+        self.points: list[CurvePoint] = []
+        self._every_steps, self._folder, self._on_point = every_steps, folder, on_point
+        self._start_s, self._due_steps = time.perf_counter(), 0
+
+    def _on_training_start(self) -> None:
+        self._due_steps = self.num_timesteps + self._every_steps
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        successes = list(self.model.ep_success_buffer or ())
+        point = CurvePoint(
+            self.num_timesteps,
+            time.perf_counter() - self._start_s,
+            float(np.mean(returns)) if returns else math.nan,
+            float(np.mean(successes)) if len(successes) >= 500 else 0.0,
+        )
+        self.points.append(point)
+        self._on_point(point)
+        if self._folder is not None and self.num_timesteps >= self._due_steps:
+            self._due_steps += self._every_steps
+            assert isinstance(self.model, PPO)
+            save_checkpoint(self.model, self._folder / f"{self.num_timesteps}.safetensors")
+
+
+def build(env: EnvConfig, config: TrainConfig) -> PPO:
+    """PPO as configured, untrained."""
+    torch.set_num_threads(config.threads)
+    return PPO(
+        AxisSharedPolicy,
+        PointMassVecEnv(env, config.vehicles, config.seed, reward_scale=config.reward_scale),
+        learning_rate=lambda remaining: config.learning_rate * max(remaining, 0.05),
+        n_steps=config.rollout,
+        batch_size=config.batch,
+        n_epochs=config.epochs,
+        gamma=config.gamma,
+        gae_lambda=config.gae_lambda,
+        seed=config.seed,
+        device="cpu",
+        stats_window_size=500,
+        policy_kwargs={
+            "log_std_init": config.log_std,
+            "actor_width": config.actor_width,
+            "critic_width": config.critic_width,
+        },
+    )
+
+
+def actor_weights(model: PPO) -> dict[str, npt.NDArray[np.float32]]:
+    """The actor's tensors as arrays, normaliser included."""
+    net = model.policy.mlp_extractor
+    assert isinstance(net, AxisSharedNet)
+    return {name: value.detach().numpy().copy() for name, value in net.actor_weights().items()}
+
+
+def train(
+    env: EnvConfig = PRESETS["default"],
+    config: TrainConfig = TRAIN_PRESETS["default"],
+    *,
+    checkpoints: Path | None = None,
+    resume: Path | None = None,
+    on_point: Callable[[CurvePoint], None] = lambda point: None,
+) -> Trained:
+    """Train from scratch, or on from a checkpoint, until ``config.steps`` are done.
+
+    Raises:
+        ArtifactError: ``resume`` is not a checkpoint of this network, or has no steps left.
+    """
+    model = build(env, config)
+    if resume is not None:
+        restore_checkpoint(model, resume)
+    recorder = CurveRecorder(max(1, config.steps // config.checkpoints), checkpoints, on_point)
+    start_s = time.perf_counter()
+    if model.num_timesteps < config.steps:
+        model.learn(config.steps - model.num_timesteps, callback=recorder, reset_num_timesteps=resume is None)
+    return Trained(actor_weights(model), tuple(recorder.points), time.perf_counter() - start_s)
