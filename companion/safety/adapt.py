@@ -29,8 +29,8 @@ def epsilon_star(p_rel: FloatArray, v_rel: FloatArray, config: SafetyConfig) -> 
     Returns:
         (M,) in [0, 1 / alpha2].
     """
-    distance = np.maximum(np.sqrt((p_rel * p_rel).sum(axis=-1)), 1e-6)
-    separation = np.maximum((p_rel * v_rel).sum(axis=-1) / distance, 0.0)
+    distance = np.maximum(np.sqrt(np.einsum("ij,ij->i", p_rel, p_rel)), 1e-6)
+    separation = np.maximum(np.einsum("ij,ij->i", p_rel, v_rel) / distance, 0.0)
     return np.asarray(np.minimum(config.epsilon_max * separation / distance, 1.0 / config.alpha2))
 
 
@@ -42,17 +42,18 @@ def clf_budget(previous: FloatArray, star: FloatArray, elapsed_s: FloatArray, et
     return np.asarray((1.0 - eta) ** (elapsed_s / CLF_PERIOD_S) * (previous - star) ** 2)
 
 
-def decay_interval(rise: FloatArray, psi: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
+def decay_interval(values: FloatArray, least: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least and greatest decay in [least, 1] with rise + e psi >= 0 for all rows of an obstacle.
 
     Args:
-        rise, psi: (..., R) [m^2].
+        values: rise and psi, stacked, (2, ..., R) [m^2].
         least: broadcast to (...,), 0 or the recovery.
     Returns:
         (lower, upper), each (...,); lower > upper where no decay serves.
     """
-    bound = -rise / np.where(np.abs(psi) < _TINY, _TINY, psi)
-    opening = psi > -_TINY
+    rise, psi = values
+    opening = psi >= 0.0
+    bound = rise / np.where(opening, -_TINY - psi, _TINY - psi)
     lower = np.maximum(np.where(opening, bound, 0.0).max(axis=-1), least)
     upper = np.where(opening, 1.0, bound).min(axis=-1)
     upper = np.minimum(upper, 1.0)

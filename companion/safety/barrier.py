@@ -46,8 +46,7 @@ class BarrierRows:
     """Rows of M obstacles, R = N + 1 each; coefficients over (1, a, |a|^2 / 2)."""
 
     ids: tuple[str, ...]
-    rise: FloatArray  # (M, R, 5) of psi_{i+1} - psi_i [m^2]
-    psi: FloatArray  # (M, R, 5) of psi_i [m^2]
+    coefficients: FloatArray  # (2, M, R, 5), C-contiguous: of psi_{i+1} - psi_i and of psi_i [m^2]
     drift: FloatArray  # (M, K, 3) c_k, vehicle minus obstacle without acceleration, ENU [m]
     reach: FloatArray  # (K,) s_k [s^2]
     radii_m: FloatArray  # (M,) vehicle plus obstacle
@@ -60,43 +59,50 @@ class BarrierRows:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def evaluate(self, a: Vec3) -> tuple[FloatArray, FloatArray]:
-        """rise and psi at ``a`` (3,), each (M, R) [m^2]."""
-        basis = monomials(a)
-        return self.rise @ basis, self.psi @ basis
+    @property
+    def rise(self) -> FloatArray:
+        """Coefficients of psi_{i+1} - psi_i, (M, R, 5) [m^2]."""
+        return np.asarray(self.coefficients[0])
 
-    def evaluate_many(self, a: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """rise and psi at ``a`` (C, 3), each (C, M, R) [m^2]."""
-        basis = monomials(a).T
-        shape = (len(a), *self.rise.shape[:2])
-        return (self.rise.reshape(-1, 5) @ basis).T.reshape(shape), (self.psi.reshape(-1, 5) @ basis).T.reshape(shape)
+    @property
+    def psi(self) -> FloatArray:
+        """Coefficients of psi_i, (M, R, 5) [m^2]."""
+        return np.asarray(self.coefficients[1])
+
+    def evaluate(self, a: Vec3) -> FloatArray:
+        """rise and psi at ``a`` (3,), stacked: (2, M, R) [m^2]."""
+        x, y, z = a.tolist()
+        basis = np.array((1.0, x, y, z, 0.5 * (x * x + y * y + z * z)))
+        return np.asarray((self.coefficients.reshape(-1, 5) @ basis).reshape(self.coefficients.shape[:3]))
+
+    def evaluate_many(self, a: FloatArray) -> FloatArray:
+        """rise and psi at ``a`` (C, 3), stacked: (2, C, M, R) [m^2]."""
+        count, rows = self.coefficients.shape[1:3]
+        flat = self.coefficients.reshape(2, count * rows, 5).swapaxes(1, 2)
+        return np.asarray((monomials(a) @ flat).reshape(2, len(a), count, rows))
 
     def gradient(self, a: Vec3, decay: FloatArray) -> tuple[FloatArray, FloatArray]:
         """d g / d a at ``a`` with the obstacles' ``decay`` (M,): (M, R, 3) [m s^2], and its norm, floored (M, R)."""
         combined = self.rise + decay[:, None, None] * self.psi
         gradient = combined[..., 1:4] + combined[..., 4:5] * a
-        norm = np.sqrt((gradient * gradient).sum(axis=-1))
+        norm = np.sqrt(np.einsum("ijk,ijk->ij", gradient, gradient))
         return gradient, np.maximum(norm, MIN_ARM_M * self.reach[2:])
 
     def positions(self, a: FloatArray) -> FloatArray:
         """r_k, vehicle minus obstacle, from k = 2 (the first that ``a`` moves): (..., 3) -> (..., M, R, 3) [m]."""
         return self.drift[:, 2:] + self.reach[2:, None] * a[..., None, None, :]
 
-    def margin(self, obstacle: int, step: int) -> Margin:
-        """The parts of one row's D."""
-        return Margin(
-            radii=float(self.radii_m[obstacle]),
-            cushion=self.cushion_m,
-            sigma=float(self.sigma_m[obstacle, step]),
-            delay=float(self.delay_m[obstacle]),
-        )
+    def margins(self, steps: npt.NDArray[np.intp]) -> list[Margin]:
+        """The parts of D of one row of each obstacle, ``steps`` (M,)."""
+        sigma = self.sigma_m[np.arange(len(steps)), steps].tolist()
+        parts = zip(self.radii_m.tolist(), sigma, self.delay_m.tolist(), strict=True)
+        return [Margin(radii, self.cushion_m, sigma, delay) for radii, sigma, delay in parts]
 
     def select(self, obstacles: npt.NDArray[np.bool_]) -> BarrierRows:
         """The rows of some obstacles only; ``obstacles`` is a boolean mask (M,)."""
         return BarrierRows(
             ids=tuple(name for name, taken in zip(self.ids, obstacles, strict=True) if taken),
-            rise=self.rise[obstacles],
-            psi=self.psi[obstacles],
+            coefficients=np.ascontiguousarray(self.coefficients[:, obstacles]),
             drift=self.drift[obstacles],
             reach=self.reach,
             radii_m=self.radii_m[obstacles],
@@ -116,6 +122,7 @@ class Barrier:
         steps = np.arange(config.horizon + 3)
         self._time_s = steps * config.dt_s
         self._reach: FloatArray = np.asarray(config.dt_s**2 * steps * (steps - 1) / 2.0, dtype=np.float64)
+        self._reach_square = self._reach**2
         self._sigma_at = np.minimum(steps[2:], round(config.sigma_growth_s / config.dt_s))
         self._letter = math.sqrt(2.0) if config.form == "paper" else 1.0
 
@@ -135,9 +142,9 @@ class Barrier:
             raise ValueError(f"prediction: expected {instants} instants (horizon + 3), got {prediction.p_enu.shape[1]}")
         drift = (p_enu + self._time_s[:, None] * v_enu) - prediction.p_enu[:, :instants]
         half_square = np.empty((*drift.shape[:2], 5))  # |r_k|^2 / 2 over the monomials
-        half_square[..., 0] = 0.5 * (drift * drift).sum(axis=-1)
+        half_square[..., 0] = 0.5 * np.einsum("ijk,ijk->ij", drift, drift)
         half_square[..., 1:4] = self._reach[:, None] * drift
-        half_square[..., 4] = self._reach**2
+        half_square[..., 4] = self._reach_square
         decayed = half_square[:, 1:] - (1.0 - config.alpha1) * half_square[:, :-1]  # psi without its D
         sigma = config.kappa * np.sqrt(prediction.sigma_m[:, self._sigma_at] ** 2 + p_std_m**2)
         sigma = np.minimum(sigma, config.sigma_cap_m)
@@ -145,12 +152,14 @@ class Barrier:
         delay = config.sigma_delay_s * np.sqrt((relative * relative).sum(axis=-1))
         radii = prediction.radius_m + config.drone_radius_m
         keep_out = self._letter * ((radii + delay + config.cushion_m)[:, None] + sigma)
-        psi = decayed[:, :-1].copy()
+        coefficients = np.empty((2, len(drift), instants - 2, 5))
+        np.subtract(decayed[:, 1:], decayed[:, :-1], out=coefficients[0])
+        psi = coefficients[1]
+        psi[...] = decayed[:, :-1]
         psi[..., 0] -= (0.5 * config.alpha1) * keep_out**2
         return BarrierRows(
             ids=prediction.ids,
-            rise=decayed[:, 1:] - decayed[:, :-1],
-            psi=psi,
+            coefficients=coefficients,
             drift=drift,
             reach=self._reach,
             radii_m=radii,

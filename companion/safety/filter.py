@@ -72,7 +72,7 @@ class SafetyFilter:
             ValueError: the prediction is shorter than horizon + 3 instants.
         """
         task = self._task(inputs)
-        lower, upper = decay_interval(*task.rows.evaluate(inputs.a_ref), task.rows.least_decay)
+        lower, upper = decay_interval(task.rows.evaluate(inputs.a_ref), task.rows.least_decay)
         if bool((lower <= upper).all()) and task.limits.admits(inputs.a_ref):
             found = Found(inputs.a_ref, lower / self._safety.alpha2, True, 0.0, 0, "none")
             return self._answer(task, found, Verdict.NOMINAL)
@@ -108,7 +108,7 @@ class SafetyFilter:
             found, fallback = solve_task(reduced, self._last, self._order), False
         except SolverError:
             found, fallback = braking(reduced, self._last), True
-        lower, upper = decay_interval(*task.rows.evaluate(found.a), task.rows.least_decay)
+        lower, upper = decay_interval(task.rows.evaluate(found.a), task.rows.least_decay)
         epsilon = np.minimum(np.maximum(task.star, lower / self._safety.alpha2), upper / self._safety.alpha2)
         epsilon[near] = found.epsilon
         return Found(found.a, epsilon, found.admissible, found.cost, found.iterations, found.solver), fallback
@@ -140,15 +140,14 @@ def _worst_rows(rows: BarrierRows, a: Vec3, epsilon: FloatArray, star: FloatArra
     rise, psi = rows.evaluate(a)
     _, norm = rows.gradient(a, decay)
     slack = (rise + decay[:, None] * psi) / norm
-    steps = slack.argmin(axis=-1)
-    return [
-        RowRecord(
-            track=name,
-            step=int(step),
-            slack=float(slack[index, step]),
-            margin=rows.margin(index, int(step)),
-            epsilon=float(epsilon[index]),
-            epsilon_star=float(star[index]),
-        )
-        for index, (name, step) in enumerate(zip(rows.ids, steps, strict=True))
-    ]
+    steps, own = slack.argmin(axis=-1), np.arange(len(rows))
+    parts = zip(
+        rows.ids,
+        steps.tolist(),
+        slack[own, steps].tolist(),
+        rows.margins(steps),
+        epsilon.tolist(),
+        star.tolist(),
+        strict=True,
+    )
+    return [RowRecord(*part) for part in parts]

@@ -38,33 +38,32 @@ class VehicleLimits:
 
     def slacks(self, a: Vec3) -> dict[str, float]:
         """Room left of each limit at ``a``, negative where broken [m/s^2]."""
-        below, above = a - self.arena_low, self.arena_high - a
-        room = np.minimum(below, above)
-        speed = math.dist((0.0, 0.0, 0.0), self.v_enu + a * self.dt_s)
+        below, above = (a - self.arena_low).tolist(), (self.arena_high - a).tolist()
         return {
-            "arena": float(min(room[0], room[1])),
-            "floor": float(below[2]),
-            "ceiling": float(above[2]),
-            "speed": (self.speed_bound_m_s - speed) / self.dt_s,
+            "arena": min(below[0], below[1], above[0], above[1]),
+            "floor": below[2],
+            "ceiling": above[2],
+            "speed": (self.speed_bound_m_s - self._speed_after(a)) / self.dt_s,
         }
+
+    def _speed_after(self, a: Vec3) -> float:
+        return math.hypot(*(self.v_enu + a * self.dt_s).tolist())
 
     def admits(self, a: Vec3) -> bool:
         """Whether ``a`` keeps every limit."""
-        if bool((a < self.low - ROUNDING_M_S2).any()) or bool((a > self.high + ROUNDING_M_S2).any()):
-            return False
-        if bool((self.arena_high < -self.box_m_s2).any()) or bool((self.arena_low > self.box_m_s2).any()):
-            return False
-        return math.dist((0.0, 0.0, 0.0), self.v_enu + a * self.dt_s) <= self.speed_bound_m_s
+        boxed = np.abs(a).max() <= self.box_m_s2 + ROUNDING_M_S2
+        walled = (a >= self.arena_low - ROUNDING_M_S2).all() and (a <= self.arena_high + ROUNDING_M_S2).all()
+        return bool(boxed and walled) and self._speed_after(a) <= self.speed_bound_m_s
 
     def slow(self, a: FloatArray) -> FloatArray:
         """How far each of ``a`` (C, 3) breaks the speed limit, 0 where it holds [m/s^2]."""
         v = self.v_enu + a * self.dt_s
-        return np.asarray(np.maximum(np.sqrt((v * v).sum(axis=-1)) - self.speed_bound_m_s, 0.0) / self.dt_s)
+        return np.asarray(np.maximum(np.sqrt(np.einsum("ij,ij->i", v, v)) - self.speed_bound_m_s, 0.0) / self.dt_s)
 
     def speed_row(self, a: Vec3) -> tuple[FloatArray, float]:
         """The tangent of the speed limit at ``a`` as ``normal @ a >= floor``."""
         v = self.v_enu + a * self.dt_s
-        speed = math.dist((0.0, 0.0, 0.0), v)
+        speed = math.hypot(*v.tolist())
         if speed < 1e-9:
             return np.zeros(3), -self.speed_bound_m_s / self.dt_s
         normal = -v / speed
@@ -75,11 +74,12 @@ class VehicleLimits:
         return np.clip(a, self.low, self.high)
 
 
-def braking_speed(distance_m: FloatArray, braking_m_s2: float, dt_s: float) -> FloatArray:
+def braking_speed(distance_m: float, braking_m_s2: float, dt_s: float) -> float:
     """Largest speed that stops within ``distance_m``: v^2 / (2 a) + v dt / 2 = d; towards the inside where d < 0."""
+    if distance_m < 0.0:
+        return RETURN_RATE_HZ * distance_m
     half = 0.5 * braking_m_s2 * dt_s
-    inside = np.sqrt(half * half + 2.0 * braking_m_s2 * np.maximum(distance_m, 0.0)) - half
-    return np.where(distance_m < 0.0, RETURN_RATE_HZ * distance_m, inside)
+    return math.sqrt(half * half + 2.0 * braking_m_s2 * distance_m) - half
 
 
 def vehicle_limits(
@@ -87,25 +87,26 @@ def vehicle_limits(
 ) -> VehicleLimits:
     """The limits at one vehicle state; the box is shrunk by what the disturbance estimate may add."""
     box = max(config.acceleration_m_s2 - shrink_m_s2, 0.0)
-    arena_low, arena_high = np.full(3, -np.inf), np.full(3, np.inf)
+    arena_low, arena_high = [-math.inf] * 3, [math.inf] * 3
+    low, high = [-box] * 3, [box] * 3
+    velocity = v_enu.tolist()
     if arena_on:
-        ahead = p_enu + v_enu * dt_s
-        room = np.array((np.subtract(config.arena_max, ahead), np.subtract(ahead, config.arena_min)))
-        allowed = braking_speed(room, BRAKING_SHARE * box, dt_s)
-        arena_high = (allowed[0] - v_enu) / dt_s
-        arena_low = (-allowed[1] - v_enu) / dt_s
-    low, high = np.clip(arena_low, -box, box), np.clip(arena_high, -box, box)
-    middle = 0.5 * (low + high)
-    crossed = low > high  # an arena narrower than a braking distance
-    low, high = np.where(crossed, middle, low), np.where(crossed, middle, high)
-    speed = math.dist((0.0, 0.0, 0.0), v_enu)
+        for axis, (p, v) in enumerate(zip(p_enu.tolist(), velocity, strict=True)):
+            ahead = p + v * dt_s
+            up = braking_speed(config.arena_max[axis] - ahead, BRAKING_SHARE * box, dt_s)
+            down = braking_speed(ahead - config.arena_min[axis], BRAKING_SHARE * box, dt_s)
+            arena_low[axis], arena_high[axis] = (-down - v) / dt_s, (up - v) / dt_s
+            least, most = min(max(arena_low[axis], -box), box), min(max(arena_high[axis], -box), box)
+            if least > most:  # an arena narrower than a braking distance
+                least = most = 0.5 * (least + most)
+            low[axis], high[axis] = least, most
     return VehicleLimits(
         box_m_s2=box,
-        low=low,
-        high=high,
-        arena_low=arena_low,
-        arena_high=arena_high,
+        low=np.array(low),
+        high=np.array(high),
+        arena_low=np.array(arena_low),
+        arena_high=np.array(arena_high),
         v_enu=v_enu,
-        speed_bound_m_s=max(config.speed_m_s, speed - 0.5 * box * dt_s),
+        speed_bound_m_s=max(config.speed_m_s, math.hypot(*velocity) - 0.5 * box * dt_s),
         dt_s=dt_s,
     )

@@ -34,13 +34,14 @@ from companion.safety.limits import VehicleLimits
 from companion.safety.qp import UNBOUNDED, Infeasible, Program, solve
 from companion.types import FloatArray, Vec3
 
-RING_POINTS = 8
 SETTLED_M_S2 = 1e-3  # iterates closer than this have converged: the answer is admissible either way
 SETTLED = 0.01  # so has a sequence whose last program saved less than this share of the cost
 INSET_M_S2 = 1e-7  # tangents are kept by this much, so that the solver's tolerance stays inside the rows
 SHARE_WEIGHT = 1e4  # cost of the whole margin, against |a - a_ref|^2 in (m/s^2)^2
 LEAVE_WEIGHT = 1e2  # the same at the end of the horizon: a vehicle inside the margin leaves it
 KEEP_WAY = 0.15  # share of the margin that another way round must offer before the last answer's is left
+_ANGLES = np.arange(8) * (2.0 * np.pi / 8)
+_RING = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), axis=-1)  # (P, 2) over (right, up)
 _STEPS = np.array([[1.0], [0.5], [0.25], [0.1]])  # shares of a program's step that are judged
 _LATTICE = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0, -1, 1)], dtype=np.float64)
 
@@ -85,7 +86,7 @@ def within_reach(rows: BarrierRows, limits: VehicleLimits) -> npt.NDArray[np.boo
     At decay 1 a row is psi_{i+1} >= 0; over |a| <= sqrt(3) box it is at least its constant less |linear| |a|.
     """
     at_one = rows.rise + rows.psi
-    linear = np.sqrt((at_one[..., 1:4] ** 2).sum(axis=-1))
+    linear = np.sqrt(np.einsum("ijk,ijk->ij", at_one[..., 1:4], at_one[..., 1:4]))
     least = at_one[..., 0] - (3.0**0.5 * limits.box_m_s2) * linear
     return np.asarray((least < 0.0).any(axis=-1))
 
@@ -93,7 +94,7 @@ def within_reach(rows: BarrierRows, limits: VehicleLimits) -> npt.NDArray[np.boo
 def judge(task: Task, a: FloatArray) -> Judgement:
     """True rows and limits at ``a`` (C, 3), all in one batch."""
     config = task.config
-    lower, upper = decay_interval(*task.rows.evaluate_many(a), task.rows.least_decay)
+    lower, upper = decay_interval(task.rows.evaluate_many(a), task.rows.least_decay)
     lower, upper = lower / config.alpha2, upper / config.alpha2
     admissible = (lower <= upper).all(axis=-1) & (task.limits.slow(a) <= config.tolerance_m_s2)
     epsilon = np.minimum(np.maximum(task.star, lower), upper)
@@ -118,19 +119,18 @@ def candidates(task: Task, last: Vec3 | None) -> FloatArray:
 
 def _ring(rows: BarrierRows) -> FloatArray:
     """Unit vectors across the relative velocity of the obstacle that comes closest, the first to the right, (P, 3)."""
-    distance = np.sqrt((rows.drift * rows.drift).sum(axis=-1)) - rows.radii_m[:, None]
-    nearest = int(distance.min(axis=-1).argmin())
-    along = rows.drift[nearest, 1] - rows.drift[nearest, 0]
-    if float(along @ along) < 1e-12:
-        along = -rows.drift[nearest, 0]
-    right = np.array([along[1], -along[0], 0.0])
-    if float(right @ right) < 1e-12 * max(float(along @ along), 1e-12):
-        right = np.array([1.0, 0.0, 0.0])
-    up = np.cross(right, along)
-    right = right / max(np.sqrt(right @ right), 1e-9)
-    up = up / max(np.sqrt(up @ up), 1e-9)
-    angles = np.arange(RING_POINTS) * (2.0 * np.pi / RING_POINTS)
-    return np.asarray(np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * up)
+    distance = np.einsum("ijk,ijk->ij", rows.drift, rows.drift).min(axis=-1)
+    nearest = rows.drift[int((np.sqrt(distance) - rows.radii_m).argmin())]
+    x, y, z = (nearest[1] - nearest[0]).tolist()
+    if x * x + y * y + z * z < 1e-12:  # at rest to each other: across the line between
+        x, y, z = (-nearest[0]).tolist()
+    level = math.hypot(x, y)
+    length = math.hypot(level, z)
+    right = (y / level, -x / level, 0.0) if level > 1e-6 * length else (1.0, 0.0, 0.0)
+    if length < 1e-9:
+        x, y, z, length = 0.0, 1.0, 0.0, 1.0
+    up = (-right[1] * z, right[0] * z, right[1] * x - right[0] * y)  # along x right, turned: up for level flight
+    return np.asarray(_RING @ (np.array((right, up)) / ((1.0,), (-length,))))
 
 
 def least_cost(task: Task, start: Found, order: tuple[str, ...]) -> Found:
@@ -172,39 +172,40 @@ def _tangent_program(task: Task, a: Vec3, epsilon: FloatArray) -> Program:
     gradient, norm = task.rows.gradient(a, decay)
     slope = config.alpha2 * psi / norm  # d row / d epsilon
     normal = gradient / norm[..., None]
-    floor = (normal @ a) + slope * epsilon[:, None] - (rise + decay[:, None] * psi) / norm + INSET_M_S2
-    least = np.where(normal > 0.0, normal * limits.low, normal * limits.high).sum(axis=-1) + top * np.minimum(
-        slope, 0.0
-    )
-    which, step = np.nonzero(least < floor)
-    kept = len(which)
+    floor = normal @ a - rise / norm + INSET_M_S2  # the terms in epsilon cancel: the row is affine in it
+    middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
+    least = normal @ middle - np.abs(normal) @ half + top * np.minimum(slope, 0.0)
+    which, step = (least < floor).nonzero()
+    kept, own = len(which), np.arange(count)
     rows = np.zeros((kept + count + 1, 3 + 2 * count))
     floors = np.empty(len(rows))
     rows[:kept, :3] = normal[which, step]
     rows[np.arange(kept), 3 + which] = slope[which, step]
     floors[:kept] = floor[which, step]
     tangent = 2.0 * (epsilon - task.star)  # of (26): delta - tangent epsilon >= V - budget - tangent epsilon_0
-    own = np.arange(count)
     rows[kept + own, 3 + own] = -tangent
     rows[kept + own, 3 + count + own] = 1.0
-    floors[kept : kept + count] = (epsilon - task.star) ** 2 - task.budget - tangent * epsilon
+    floors[kept:-1] = (epsilon - task.star) ** 2 - task.budget - tangent * epsilon
     rows[-1, :3], floors[-1] = limits.speed_row(a)
-    each = np.ones(count)
-    return Program(
-        weight=2.0
-        * np.concatenate((np.full(3, config.lambda_u), config.lambda_epsilon * each, config.lambda_delta * each)),
-        linear=-2.0 * np.concatenate((config.lambda_u * task.a_ref, config.lambda_epsilon * task.star, 0.0 * each)),
-        low=np.concatenate((limits.low, task.rows.least_decay / config.alpha2, 0.0 * each)),
-        high=np.concatenate((limits.high, top * each, UNBOUNDED * each)),
-        rows=rows,
-        floor=floors,
-    )
+    return _priced(task, rows, floors)
+
+
+def _priced(task: Task, rows: FloatArray, floors: FloatArray) -> Program:
+    """The program of (29)'s cost and bounds with the given rows."""
+    config, limits, count = task.config, task.limits, len(task.rows)
+    epsilons, deltas = slice(3, 3 + count), slice(3 + count, None)
+    weight, linear, low, high = np.zeros((4, 3 + 2 * count))
+    weight[:3], weight[epsilons], weight[deltas] = config.lambda_u, config.lambda_epsilon, config.lambda_delta
+    linear[:3], linear[epsilons] = config.lambda_u * task.a_ref, config.lambda_epsilon * task.star
+    low[:3], low[epsilons] = limits.low, task.rows.least_decay / config.alpha2
+    high[:3], high[epsilons], high[deltas] = limits.high, 1.0 / config.alpha2, UNBOUNDED
+    return Program(2.0 * weight, -2.0 * linear, low, high, rows, floors)
 
 
 def shares(rows: BarrierRows, a: FloatArray) -> FloatArray:
     """Least share of the margin left by any obstacle over the horizon at ``a`` (C, 3): 1 all, 0 contact, (C,)."""
     r = rows.positions(a)
-    distance = np.sqrt((r * r).sum(axis=-1))
+    distance = np.sqrt(np.einsum("...k,...k->...", r, r))
     share = (distance - rows.radii_m[:, None]) / _margins(rows)
     return np.asarray(share.min(axis=(-2, -1), initial=1.0))
 
@@ -236,7 +237,7 @@ def _widest(task: Task, starts: FloatArray, low: Vec3, high: Vec3, order: tuple[
         previous, a = a, np.clip(x[:3], low, high)
         if float(np.abs(a - previous).max()) < SETTLED_M_S2:
             break
-    lower, upper = decay_interval(*task.rows.evaluate(a), task.rows.least_decay)
+    lower, upper = decay_interval(task.rows.evaluate(a), task.rows.least_decay)
     epsilon = np.clip(0.5 * (lower + upper), 0.0, 1.0) / task.config.alpha2
     return Found(a, epsilon, False, np.inf, count, solver)
 
@@ -245,7 +246,7 @@ def _share_program(task: Task, a: Vec3, low: Vec3, high: Vec3) -> Program:
     """Variables a, t, t at the horizon's end, the speed limit's slack: |r_k|'s tangent at ``a`` >= R + t (D - R)."""
     rows = task.rows
     r = rows.positions(a)
-    distance = np.maximum(np.sqrt((r * r).sum(axis=-1)), 1e-9)
+    distance = np.maximum(np.sqrt(np.einsum("ijk,ijk->ij", r, r)), 1e-9)
     reach = rows.reach[2:]
     normal = r * (reach[:, None] / distance[..., None])
     floor = (normal @ a) - distance + rows.radii_m[:, None]

@@ -114,7 +114,7 @@ def test_obstacles_out_of_reach_never_bind(inputs: FilterInput) -> None:
     limits = vehicle_limits(inputs.p_enu, inputs.v_enu, LIMITS, arena_on=True, shrink_m_s2=0.0, dt_s=0.05)
     far = rows.select(~within_reach(rows, limits))
     points = np.random.default_rng(0).uniform(-3.0, 3.0, (100, 3))
-    lower, _ = decay_interval(*far.evaluate_many(points), far.least_decay)
+    lower, _ = decay_interval(far.evaluate_many(points), far.least_decay)
     assert (lower <= 1.0).all()
 
 

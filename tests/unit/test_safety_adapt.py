@@ -45,19 +45,19 @@ def test_clf_budget_halves_each_twentieth_of_a_second() -> None:
     ],
 )
 def test_decay_interval_by_hand(rise: tuple[float, ...], psi: tuple[float, ...], expected: tuple[float, float]) -> None:
-    lower, upper = decay_interval(np.array([rise]), np.array([psi]), np.zeros(1))
+    lower, upper = decay_interval(np.array([[rise], [psi]]), np.zeros(1))
     assert (lower[0], upper[0]) == pytest.approx(expected)
 
 
 def test_a_row_with_psi_zero_and_falling_has_no_decay() -> None:
-    lower, upper = decay_interval(np.array([[-0.1]]), np.array([[0.0]]), np.zeros(1))
+    lower, upper = decay_interval(np.array([[[-0.1]], [[0.0]]]), np.zeros(1))
     assert lower[0] > upper[0]
 
 
 def test_interval_against_brute_force() -> None:
     rng = np.random.default_rng(3)
     rise, psi = rng.normal(0.3, 1.0, (200, 5)), rng.normal(0.5, 1.0, (200, 5))
-    lower, upper = decay_interval(rise, psi, np.zeros(200))
+    lower, upper = decay_interval(np.stack((rise, psi)), np.zeros(200))
     grid = np.linspace(0.0, 1.0, 1001)
     holds = (rise[:, None, :] + grid[:, None] * psi[:, None, :] >= 0.0).all(axis=-1)
     inside = (grid >= lower[:, None]) & (grid <= upper[:, None])
@@ -68,8 +68,8 @@ def test_interval_against_brute_force() -> None:
 def test_inside_the_keep_out_distance_the_decay_has_a_floor() -> None:
     """At rest inside: psi_0 < 0 and nothing changes; without a floor decay 0 would call that admissible."""
     rise, psi = np.array([[0.0, 0.0]]), np.array([[-0.1, -0.1]])
-    assert decay_interval(rise, psi, np.zeros(1))[0][0] == 0.0
-    lower, upper = decay_interval(rise, psi, np.array([0.02]))
+    assert decay_interval(np.stack((rise, psi)), np.zeros(1))[0][0] == 0.0
+    lower, upper = decay_interval(np.stack((rise, psi)), np.array([0.02]))
     assert lower[0] > upper[0]
-    leaving = decay_interval(rise + 0.01, psi, np.array([0.02]))
+    leaving = decay_interval(np.stack((rise + 0.01, psi)), np.array([0.02]))
     assert (leaving[0][0], leaving[1][0]) == pytest.approx((0.02, 0.1))

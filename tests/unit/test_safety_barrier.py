@@ -124,7 +124,7 @@ def test_first_row_of_a_head_on_obstacle_by_hand() -> None:
         frozen([0.2]),
     )
     rows = Barrier(config).rows(np.zeros(3), np.zeros(3), prediction, 0.0)
-    assert rows.margin(0, 0).total == pytest.approx(0.5)
+    assert rows.margins(np.array([0]))[0].total == pytest.approx(0.5)
     rise, psi = rows.evaluate(np.array([2.0, 0.0, 0.0]))
     assert psi[0, 0] == pytest.approx(1.5)
     assert rise[0, 0] == pytest.approx(-0.01 + 4 * 3.125e-6)
@@ -134,7 +134,7 @@ def test_margin_parts_are_kept_apart() -> None:
     config = SafetyConfig(kappa=2.0, sigma_delay_s=0.1)
     prediction = make_prediction(config, count=1)
     rows = Barrier(config).rows(P, V, prediction, 0.3)
-    margin = rows.margin(0, 4)
+    margin = rows.margins(np.array([4]))[0]
     assert margin.radii == pytest.approx(0.2 + prediction.radius_m[0])
     assert margin.cushion == 0.1
     assert margin.sigma == pytest.approx(2.0 * math.hypot(prediction.sigma_m[0, 6], 0.3))

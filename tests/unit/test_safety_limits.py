@@ -17,9 +17,9 @@ def at(p: tuple[float, ...], v: tuple[float, ...], *, arena_on: bool = True, shr
 
 def test_braking_speed_by_hand() -> None:
     """2 m/s^2 on a 0.05 s grid: 4 m/s takes 4^2 / 4 + 4 * 0.025 = 4.1 m."""
-    assert braking_speed(np.array(4.1), 2.0, 0.05) == pytest.approx(4.0)
-    assert braking_speed(np.array(0.0), 2.0, 0.05) == pytest.approx(0.0)
-    assert braking_speed(np.array(-0.5), 2.0, 0.05) == pytest.approx(-0.5)
+    assert braking_speed(4.1, 2.0, 0.05) == pytest.approx(4.0)
+    assert braking_speed(0.0, 2.0, 0.05) == pytest.approx(0.0)
+    assert braking_speed(-0.5, 2.0, 0.05) == pytest.approx(-0.5)
 
 
 def test_far_from_everything_only_the_box_is_left() -> None:
@@ -33,7 +33,7 @@ def test_far_from_everything_only_the_box_is_left() -> None:
 def test_near_a_wall_the_bound_is_the_braking_distance() -> None:
     limits = at((9.0, 0.0, 5.0), (1.5, 0.0, 0.0))
     distance = 10.0 - 9.0 - 0.075
-    expected = (float(braking_speed(np.array(distance), BRAKING_SHARE * 3.0, 0.05)) - 1.5) / 0.05
+    expected = (braking_speed(distance, BRAKING_SHARE * 3.0, 0.05) - 1.5) / 0.05
     assert limits.arena_high[0] == pytest.approx(expected)
     slacks = limits.slacks(np.array([expected, 0.0, 0.0]))
     assert slacks["arena"] == pytest.approx(0.0, abs=1e-9)
