@@ -1,6 +1,6 @@
 """The safety filter: the paper's (29) for several obstacles, with an answer that is checked before it leaves.
 
-    minimise over a, epsilon_j, delta_j   the cost of `search`
+    minimise over a, epsilon_j, delta_j   the cost of `task`
     subject to   rows (24) for every obstacle j and step i = 0..N                     `barrier`
                  CLF (26) of each epsilon_j, relaxed by delta_j >= 0                  `adapt`
                  acceleration box, arena with floor and ceiling, speed                `limits`
@@ -29,7 +29,9 @@ from companion.errors import SolverError
 from companion.safety.adapt import clf_budget, decay_interval, epsilon_star
 from companion.safety.barrier import Barrier, BarrierRows
 from companion.safety.limits import vehicle_limits
-from companion.safety.search import Found, Task, braking, solve_task, within_reach
+from companion.safety.relax import braking
+from companion.safety.search import solve_task
+from companion.safety.task import Found, Task, within_reach
 from companion.types import FilterResult, FloatArray, Prediction, RowRecord, Vec3, Verdict, frozen
 
 LIMIT_LISTED_M_S2 = 0.05  # a vehicle limit with less room than this is listed with the answer

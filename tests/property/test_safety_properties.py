@@ -11,7 +11,7 @@ from companion.safety.adapt import decay_interval
 from companion.safety.barrier import Barrier
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.safety.limits import vehicle_limits
-from companion.safety.search import within_reach
+from companion.safety.task import within_reach
 from companion.types import Prediction, Verdict, frozen
 
 SAFETY, LIMITS = SafetyConfig(), LimitsConfig()

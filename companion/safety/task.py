@@ -1,0 +1,115 @@
+"""One tick's problem, and what its true rows and limits say about any acceleration.
+
+Cost (29), over a, epsilon_j and delta_j of the obstacles within reach:
+
+    lambda_u |a - a_ref|^2 + sum_j lambda_epsilon (epsilon_j - epsilon*_j)^2 + lambda_delta delta_j^2
+
+For a given a the cheapest epsilon and delta are known in closed form, so accelerations are judged in batches. What
+lies inside a row's ball has several ways round it: `candidates` offers them, and for a head-on obstacle, where all
+cost the same, the order of the ring decides: to the right.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from companion.config import SafetyConfig
+from companion.safety.adapt import decay_interval
+from companion.safety.barrier import BarrierRows
+from companion.safety.limits import VehicleLimits
+from companion.types import FloatArray, Vec3
+
+_ANGLES = np.arange(8) * (2.0 * np.pi / 8)
+_RING = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), axis=-1)  # (P, 2) over (right, up)
+_LATTICE = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0, -1, 1)], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One tick's problem."""
+
+    rows: BarrierRows
+    limits: VehicleLimits
+    a_ref: Vec3
+    star: FloatArray  # (M,) epsilon*
+    budget: FloatArray  # (M,) what the CLF leaves (epsilon - epsilon*)^2 without delta
+    config: SafetyConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An acceleration, whether its true rows and limits hold, and how it was found."""
+
+    a: Vec3
+    epsilon: FloatArray  # (M,)
+    admissible: bool
+    cost: float
+    iterations: int
+    solver: str
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """True rows and limits at C accelerations."""
+
+    lower: FloatArray  # (C, M) least epsilon
+    upper: FloatArray  # (C, M) greatest epsilon
+    admissible: npt.NDArray[np.bool_]  # (C,)
+    cost: FloatArray  # (C,) with the cheapest epsilon
+
+
+def within_reach(rows: BarrierRows, limits: VehicleLimits) -> npt.NDArray[np.bool_]:
+    """Obstacles that can bind: not those whose rows hold at decay 1 for every acceleration of the box, (M,).
+
+    At decay 1 a row is psi_{i+1} >= 0; over |a| <= sqrt(3) box it is at least its constant less |linear| |a|.
+    """
+    at_one = rows.rise + rows.psi
+    linear = np.sqrt(np.einsum("ijk,ijk->ij", at_one[..., 1:4], at_one[..., 1:4]))
+    least = at_one[..., 0] - (3.0**0.5 * limits.box_m_s2) * linear
+    return np.asarray((least < 0.0).any(axis=-1))
+
+
+def judge(task: Task, a: FloatArray) -> Judgement:
+    """True rows and limits at ``a`` (C, 3), all in one batch."""
+    config = task.config
+    lower, upper = decay_interval(task.rows.evaluate_many(a), task.rows.least_decay)
+    lower, upper = lower / config.alpha2, upper / config.alpha2
+    admissible = (lower <= upper).all(axis=-1) & (task.limits.slow(a) <= config.tolerance_m_s2)
+    epsilon = np.minimum(np.maximum(task.star, lower), upper)
+    deviation = (epsilon - task.star) ** 2
+    delta = np.maximum(deviation - task.budget, 0.0)
+    priced = config.lambda_epsilon * deviation + config.lambda_delta * delta * delta
+    cost = config.lambda_u * ((a - task.a_ref) ** 2).sum(axis=-1) + priced.sum(axis=-1)
+    return Judgement(lower, upper, admissible, cost)
+
+
+def candidates(task: Task, last: Vec3 | None) -> FloatArray:
+    """Where a search may start, all inside box and arena: (C, 3)."""
+    box = task.limits.box_m_s2
+    starts = [task.a_ref[None], box * _LATTICE]
+    if last is not None:
+        starts.insert(0, last[None])
+    if len(task.rows):
+        ring = _ring(task.rows)
+        starts += [box * ring, 0.5 * box * ring]
+    return task.limits.clip(np.concatenate(starts))
+
+
+def _ring(rows: BarrierRows) -> FloatArray:
+    """Unit vectors across the relative velocity of the obstacle that comes closest, the first to the right, (P, 3)."""
+    distance = np.einsum("ijk,ijk->ij", rows.drift, rows.drift).min(axis=-1)
+    nearest = rows.drift[int((np.sqrt(distance) - rows.radii_m).argmin())]
+    x, y, z = (nearest[1] - nearest[0]).tolist()
+    if x * x + y * y + z * z < 1e-12:  # at rest to each other: across the line between
+        x, y, z = (-nearest[0]).tolist()
+    level = math.hypot(x, y)
+    length = math.hypot(level, z)
+    right = (y / level, -x / level, 0.0) if level > 1e-6 * length else (1.0, 0.0, 0.0)
+    if length < 1e-9:
+        x, y, z, length = 0.0, 1.0, 0.0, 1.0
+    up = (-right[1] * z, right[0] * z, right[1] * x - right[0] * y)  # along x right, turned: up for level flight
+    return np.asarray(_RING @ (np.array((right, up)) / ((1.0,), (-length,))))
