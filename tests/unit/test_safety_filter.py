@@ -193,7 +193,7 @@ def fly(start: tuple[float, ...], obstacle: tuple[float, ...], velocity: tuple[f
     """Euler point mass with a proportional reference to (6, 0, 2): clearances, and whether it arrived."""
     guard, target = SafetyFilter(SAFETY, LIMITS), np.array([6.0, 0.0, 2.0])
     p, v, o, clearances = np.array(start), np.zeros(3), np.array(obstacle), []
-    for step in range(260):
+    for step in range(320):
         a_ref = np.clip(1.5 * (target - p) - 2.2 * v, -2.5, 2.5)
         result = guard.step(
             FilterInput(p, v, a_ref, straight([tuple(o)], [velocity]), elapsed_s=0.05 if step else None)
