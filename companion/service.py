@@ -38,6 +38,7 @@ log = logging.getLogger("companion")
 HEARTBEAT_NS = NS_PER_S
 STATUS_NS = NS_PER_S // 5
 TIMESYNC_NS = NS_PER_S
+TIMESYNC_SETTLING_NS = NS_PER_S // 10
 STALL_NS = NS_PER_S  # lockstep: no progress for this much wall time ends the run
 WAKE_S = 0.2  # of wall time: heartbeats, timeouts and the stall guard need no telemetry
 RELEASE_NS = 6 * NS_PER_S // 10  # on shutdown in flight the autopilot is given this long to show its hold mode
@@ -257,7 +258,8 @@ class Service:
         now_ns, wall_ns = self._now_ns(), self._clock.monotonic_ns()
         if not self._lockstep:
             self._session.poll(now_ns)
-            if self._last_timesync_ns is None or wall_ns - self._last_timesync_ns >= TIMESYNC_NS:
+            every_ns = TIMESYNC_NS if self._timesync.settled else TIMESYNC_SETTLING_NS
+            if self._last_timesync_ns is None or wall_ns - self._last_timesync_ns >= every_ns:
                 self._last_timesync_ns = wall_ns
                 self._transport.send(self._codec.encode_timesync_request(self._timesync.request(wall_ns)))
         state = self._session.situation.state

@@ -50,6 +50,7 @@ class GroundStation:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", port))
         self._peer: tuple[str, int] | None = None
+        self._unread: list[Any] = []  # one datagram carries several messages
 
     def close(self) -> None:
         self._socket.close()
@@ -58,14 +59,16 @@ class GroundStation:
         """The first message that ``accept`` takes. Raises TimeoutError naming ``what``."""
         deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0.0:
+            while self._unread:
+                message = self._unread.pop(0)
+                if accept(message):
+                    return message
             self._socket.settimeout(left)
             try:
                 data, self._peer = self._socket.recvfrom(4096)
             except TimeoutError:
                 break
-            for message in self._codec.parse_buffer(data) or []:
-                if accept(message):
-                    return message
+            self._unread.extend(self._codec.parse_buffer(data) or [])
         raise TimeoutError(f"ground station: no {what} within {timeout_s} s")
 
     def command(self, command: int, *params: float, component: int = 1) -> None:
