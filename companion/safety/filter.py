@@ -31,7 +31,7 @@ from companion.safety.barrier import Barrier, BarrierRows
 from companion.safety.limits import vehicle_limits
 from companion.safety.relax import braking
 from companion.safety.search import solve_task
-from companion.safety.task import Found, Task, within_reach
+from companion.safety.task import Found, Task, turned, within_reach
 from companion.types import FilterResult, FloatArray, Prediction, RowRecord, Vec3, Verdict, frozen
 
 LIMIT_LISTED_M_S2 = 0.05  # a vehicle limit with less room than this is listed with the answer
@@ -102,10 +102,9 @@ class SafetyFilter:
     def _solve(self, task: Task) -> tuple[Found, bool]:
         """The answer with epsilons of all obstacles, and whether it had to do without solvers."""
         near = within_reach(task.rows, task.limits)
-        reduced = task
-        if not near.all():
-            rows = task.rows.select(near)
-            reduced = Task(rows, task.limits, task.a_ref, task.star[near], task.budget[near], task.config)
+        rows = task.rows if near.all() else task.rows.select(near)
+        a_ref = turned(rows, task.a_ref)
+        reduced = Task(rows, task.limits, a_ref, task.star[near], task.budget[near], task.config)
         try:
             found, fallback = solve_task(reduced, self._last, self._order), False
         except SolverError:

@@ -6,7 +6,8 @@ Cost (29), over a, epsilon_j and delta_j of the obstacles within reach:
 
 For a given a the cheapest epsilon and delta are known in closed form, so accelerations are judged in batches. What
 lies inside a row's ball has several ways round it: `candidates` offers them, and for a head-on obstacle, where all
-cost the same, the order of the ring decides: to the right.
+cost the same, the order of the ring decides: to the right. A vehicle that already stands at an obstacle and is sent
+through it has no cheaper way than to stand still, or to be pushed along; there `turned` sends it round the side.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from companion.types import FloatArray, Vec3
 
 _ANGLES = np.arange(8) * (2.0 * np.pi / 8)
 _RING = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)), axis=-1)  # (P, 2) over (right, up)
+STANDING_M = 0.3  # nearer than this to the keep-out distance,
+STANDING_M_S = 0.8  # slower than this against the obstacle,
+STANDING_COS = 0.8  # and sent at it within 37 degrees: the vehicle stands in front of it
 _LATTICE = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0, -1, 1)], dtype=np.float64)
 
 
@@ -97,6 +101,30 @@ def candidates(task: Task, last: Vec3 | None) -> FloatArray:
         ring = _ring(task.rows)
         starts += [box * ring, 0.5 * box * ring]
     return task.limits.clip(np.concatenate(starts))
+
+
+def turned(rows: BarrierRows, a_ref: Vec3) -> Vec3:
+    """``a_ref``, with as much again sideways where the vehicle stands at an obstacle and is sent through it.
+
+    The side is the one to which the vehicle already moves against the obstacle, else the right.
+    """
+    strength = math.hypot(*a_ref.tolist())
+    if not len(rows) or strength < 1e-3:
+        return a_ref
+    r, v = rows.drift[:, 0], (rows.drift[:, 1] - rows.drift[:, 0]) / math.sqrt(rows.reach[2])
+    distance = np.sqrt(np.einsum("ij,ij->i", r, r))
+    standing = (distance - rows.keep_out_m[:, 0] < STANDING_M) & (np.einsum("ij,ij->i", v, v) < STANDING_M_S**2)
+    standing &= r @ a_ref < -STANDING_COS * strength * distance
+    if not standing.any():
+        return a_ref
+    nearest = int(np.where(standing, distance, np.inf).argmin())
+    towards = -r[nearest] / distance[nearest]
+    side = v[nearest] - (v[nearest] @ towards) * towards
+    speed = math.hypot(*side.tolist())
+    if speed < 0.02:
+        side = np.array((towards[1], -towards[0], 0.0)) if abs(towards[2]) < 0.99 else np.array((1.0, 0.0, 0.0))
+        speed = math.hypot(*side.tolist())
+    return np.asarray(a_ref + (strength / speed) * side)
 
 
 def _ring(rows: BarrierRows) -> FloatArray:
