@@ -61,7 +61,6 @@ class PilotOutput:
     result: FilterResult
     wire: Vec3  # u_safe less the disturbance estimate: what the autopilot is sent
     disturbance: Vec3
-    tracks: TrackTable
     prediction: Prediction
     policy_valid: bool
     obstacle_frames: int
@@ -98,9 +97,9 @@ class Pilot:
         self._anchor: Vec3 | None = None
         self._task: Task | None = None
 
-    @property
-    def track_count(self) -> int:
-        return len(self._tracker.table())
+    def tracks(self) -> TrackTable:
+        """The tracks as the last step left them; apart from it, because nobody waits for them."""
+        return self._tracker.table()
 
     def step(self, inputs: PilotInput, *, sent: bool = True) -> PilotOutput:
         """The safe acceleration for one tick.
@@ -124,14 +123,12 @@ class Pilot:
         wire = frozen(result.a_safe - disturbance)
         self._commands.append((start_ns, result.a_safe if sent else _ZERO))
         self._observer.command(wire if sent else _ZERO, saturated=self._saturated(wire))
-        tracks = self._tracker.table()
         return PilotOutput(
             stamp_ns=vehicle.stamp_ns,
             u_ref=u_ref,
             result=result,
             wire=wire,
             disturbance=disturbance,
-            tracks=tracks,
             prediction=prediction,
             policy_valid=valid,
             obstacle_frames=len(inputs.frames),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import msgspec
 
@@ -15,7 +15,7 @@ from companion.record import Recorder
 from companion.report import FlightHash, tracks_out, vehicle_out
 from companion.session import VehicleSession
 from companion.state import State
-from companion.types import NS_PER_S, DetectionFrame, Vec3, VehicleState
+from companion.types import NS_PER_S, DetectionFrame, TrackTable, Vec3, VehicleState
 
 log = logging.getLogger("companion")
 
@@ -30,6 +30,7 @@ class Publisher:
         self._recorder = recorder
         self._hash = FlightHash()
         self._verdict = "silent"
+        self._tracks = 0
         self._last: tuple[int, object] | None = None
 
     @property
@@ -43,18 +44,21 @@ class Publisher:
         vehicle: VehicleState,
         frames: tuple[DetectionFrame, ...],
         output: PilotOutput | None,
+        tracks: Callable[[], TrackTable],
     ) -> None:
-        """One tick's record, vehicle and tracks."""
+        """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left."""
         self._verdict = record.verdict
         self._zenoh.put("companion/setpoint", record)
+        table = tracks()
+        self._tracks = len(table)
         payloads: dict[str, msgspec.Struct] = {"companion/setpoint": record}
         if self._recorder is not None or self._zenoh.wanted("companion/vehicle"):
             payloads["companion/vehicle"] = vehicle_out(vehicle)
             self._zenoh.put("companion/vehicle", payloads["companion/vehicle"])
         if output is not None and (self._recorder is not None or self._zenoh.wanted("companion/tracks")):
-            payloads["companion/tracks"] = tracks_out(output)
+            payloads["companion/tracks"] = tracks_out(output, table)
             self._zenoh.put("companion/tracks", payloads["companion/tracks"])
-        self._hash.tick(state, vehicle, frames, output)
+        self._hash.tick(state, vehicle, frames, output, table)
         if self._recorder is not None:
             self._recorder.frames(frames, vehicle.stamp_ns)
             for key, payload in payloads.items():
@@ -67,7 +71,6 @@ class Publisher:
         session: VehicleSession,
         *,
         target_enu: Vec3 | None,
-        tracks: int,
         counts: Mapping[str, int],
         meter: TickMeter,
     ) -> None:
@@ -89,7 +92,7 @@ class Publisher:
             armed=session.armed,
             airborne=situation.airborne,
             target=target,
-            tracks=tracks,
+            tracks=self._tracks,
             verdict=self._verdict,
             counts=dict(counts),
             tick_ms=meter.quantiles_ms(last=1000),

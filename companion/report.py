@@ -11,7 +11,7 @@ import numpy as np
 from companion.link.wire import MarginOut, RowOut, SetpointRecord, TrackOut, TracksOut, Vec, VehicleOut
 from companion.pilot import PilotOutput
 from companion.state import State
-from companion.types import DetectionFrame, RowRecord, Vec3, VehicleState, Verdict
+from companion.types import DetectionFrame, RowRecord, TrackTable, Vec3, VehicleState, Verdict
 
 _UPPER = np.triu_indices(6)
 
@@ -55,7 +55,7 @@ def setpoint_record(
         rows=[_row(row) for row in result.rows],
         worst=None if result.worst is None else _row(result.worst),
         disturbance=_vec(output.disturbance),
-        tracks=len(output.tracks),
+        tracks=len(output.prediction),
         timings_ms=dict(timings_ms),
     )
 
@@ -70,8 +70,8 @@ def vehicle_out(vehicle: VehicleState) -> VehicleOut:
     )
 
 
-def tracks_out(output: PilotOutput) -> TracksOut:
-    table, prediction = output.tracks, output.prediction
+def tracks_out(output: PilotOutput, table: TrackTable) -> TracksOut:
+    prediction = output.prediction
     predicted = dict(zip(prediction.ids, prediction.p_enu.tolist(), strict=True))
     covariances = table.covariance[:, :6, :6][:, _UPPER[0], _UPPER[1]].tolist()
     rows = zip(
@@ -109,7 +109,12 @@ class FlightHash:
         self._sha = hashlib.sha256()
 
     def tick(
-        self, state: State, vehicle: VehicleState, frames: tuple[DetectionFrame, ...], output: PilotOutput | None
+        self,
+        state: State,
+        vehicle: VehicleState,
+        frames: tuple[DetectionFrame, ...],
+        output: PilotOutput | None,
+        table: TrackTable,
     ) -> None:
         add = self._sha.update
         add(struct.pack("<q", vehicle.stamp_ns) + state.value.encode())
@@ -120,7 +125,7 @@ class FlightHash:
                 add(str(seen.id).encode() + seen.p_enu.tobytes() + struct.pack("<d", seen.radius_m))
         if output is None:
             return
-        table, result = output.tracks, output.result
+        result = output.result
         add("\0".join(table.ids).encode() + table.p_enu.tobytes() + table.v_enu.tobytes())
         add(table.covariance.tobytes() + table.mode_probabilities.tobytes())
         add(output.u_ref.tobytes() + result.a_safe.tobytes() + output.wire.tobytes())

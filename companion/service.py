@@ -210,7 +210,7 @@ class Service:
         record = setpoint_record(
             vehicle.stamp_ns, session.situation.state, output, sent=sent, messages=messages, timings_ms=timings_ms
         )
-        self._publisher.tick(record, session.situation.state, vehicle, frames, output)
+        self._publisher.tick(record, session.situation.state, vehicle, frames, output, self._pilot.tracks)
         self._meter.tick(timings_ms["total"], record.verdict)
 
     def _think(self, vehicle: VehicleState, frames: tuple[DetectionFrame, ...]) -> PilotOutput | None:
@@ -283,7 +283,6 @@ class Service:
             self._vehicle_ns,
             self._session,
             target_enu=self._route.current,
-            tracks=self._pilot.track_count,
             counts=self._counts(),
             meter=self._meter,
         )
