@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 
 from companion.config import Config
+from companion.policy import load_policy
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.tracking.tracker import Tracker
 from companion.types import (
@@ -123,6 +124,14 @@ def stand_in_reference(limit_m_s2: float, speed_m_s: float) -> Reference:
     return act
 
 
+def shipped_reference(config: Config) -> Reference:
+    """The policy of the configuration, clipped as the pilot clips it: the limit less the disturbance's reserve."""
+    policy = load_policy(config.policy, config.limits)
+    reserve = config.disturbance.bound_m_s2 if config.disturbance.enabled else 0.0
+    limit = config.limits.acceleration_m_s2 - reserve
+    return lambda v_enu, e_enu: np.clip(policy.act(v_enu, e_enu), -limit, limit)
+
+
 class _Loop:
     """Tracker, delay compensation and filter around a point mass, one tick at a time."""
 
@@ -209,7 +218,7 @@ def fly(
             v = v + a * h
             p = p + v * h
             path[substep] = p
-        times = step * TICK_S + h * np.arange(1, SUBSTEPS + 1)
+        times: FloatArray = step * TICK_S + h * np.arange(1.0, SUBSTEPS + 1.0)
         for obstacle, reach in zip(encounter.obstacles, radii, strict=True):
             gap = np.linalg.norm(path - obstacle.position(times), axis=-1).min() - reach
             flight.clearance_m = min(flight.clearance_m, float(gap))
