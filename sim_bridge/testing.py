@@ -97,13 +97,13 @@ class FlyingPair:
 
         onboard, gcs = free_port(), free_port()
         self.endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-        daemon_endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        self.daemon_endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self.prefix = "uav/uav1"
         self.ground_station = GroundStation(gcs)
         config = folder / "companion.toml"
         config.write_text(
             f'[mavlink]\nurl = "udpin://127.0.0.1:{onboard}"\nsystem_id = 1\n'
-            f'[zenoh]\nconnect = ["{self.endpoint}"]\nlisten = ["{daemon_endpoint}"]\n'
+            f'[zenoh]\nconnect = ["{self.endpoint}"]\nlisten = ["{self.daemon_endpoint}"]\n'
             f"[target]\nposition = {[float(x) for x in target]}\n",
             encoding="utf-8",
         )
@@ -114,7 +114,7 @@ class FlyingPair:
         self.simulator = self._start(sim, self._logs[0])
         self.daemon = self._start(["companion.cli", "run", "-c", str(config), *sets], self._logs[1])
         self._status: queue.Queue[dict[str, Any]] = queue.Queue()
-        self.zenoh = zenoh.open(_zenoh_config(zenoh, [self.endpoint, daemon_endpoint]))
+        self.zenoh = zenoh.open(_zenoh_config(zenoh, [self.endpoint, self.daemon_endpoint]))
         self._subscriber = self.zenoh.declare_subscriber(
             f"{self.prefix}/companion/status", lambda sample: self._status.put(json.loads(sample.payload.to_bytes()))
         )
