@@ -38,6 +38,8 @@ from companion.types import FloatArray
 
 _LOG_2PI = math.log(2.0 * math.pi)
 _EYE = np.eye(MODELS)
+_WELL_CONDITIONED = 1e-4  # least determinant of S over the product of its diagonal
+_VARIANCE_LIMIT = 1e4  # of any component; with R above 1e-6 an update keeps six digits
 # Cofactors of a symmetric 3x3 in row-major order: entry k is S[f1] S[f2] - S[f3] S[f4].
 _COFACTOR = np.array(
     [
@@ -186,15 +188,20 @@ def correct(
 
 
 def _invert(s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverse and log-determinant of symmetric positive definite (..., d, d); d = 3 by cofactors."""
-    if s.shape[-1] != 3:
-        return np.asarray(np.linalg.inv(s), dtype=np.float64), np.asarray(np.linalg.slogdet(s)[1])
-    flat = np.ascontiguousarray(s).reshape(*s.shape[:-2], 9)
-    f1, f2, f3, f4 = _COFACTOR
-    cofactor = flat.take(f1, axis=-1) * flat.take(f2, axis=-1) - flat.take(f3, axis=-1) * flat.take(f4, axis=-1)
-    determinant = (flat[..., :3] * cofactor[..., :3]).sum(axis=-1)
-    inverse: FloatArray = (cofactor / determinant[..., None]).reshape(s.shape)
-    return inverse, np.log(determinant)
+    """Inverse and log-determinant of symmetric positive definite (..., d, d).
+
+    d = 3 goes by cofactors, many times faster than LAPACK for small matrices. They lose digits with the square of the
+    condition number, so a batch with a nearly singular member takes the slow way.
+    """
+    if s.shape[-1] == 3:
+        flat = np.ascontiguousarray(s).reshape(*s.shape[:-2], 9)
+        f1, f2, f3, f4 = _COFACTOR
+        cofactor = flat.take(f1, axis=-1) * flat.take(f2, axis=-1) - flat.take(f3, axis=-1) * flat.take(f4, axis=-1)
+        determinant = (flat[..., :3] * cofactor[..., :3]).sum(axis=-1)
+        if (determinant > _WELL_CONDITIONED * flat[..., ::4].prod(axis=-1)).all():
+            inverse: FloatArray = (cofactor / determinant[..., None]).reshape(s.shape)
+            return inverse, np.log(determinant)
+    return np.asarray(np.linalg.inv(s), dtype=np.float64), np.asarray(np.linalg.slogdet(s)[1])
 
 
 def step(
@@ -210,6 +217,8 @@ def step(
     """
     x, covariance, prior = mix(bank, dt, constants)
     x, covariance = propagate(x, covariance, dt, constants.models)
+    if covariance.size and covariance.max() > _VARIANCE_LIMIT:  # an absurd measurement tore the models apart
+        covariance = _bounded(covariance, np.full(SIZE, _VARIANCE_LIMIT))
     if foreign:
         covariance, noise = _shared(covariance, prior, noise)
     x, covariance, log_likelihood, nis = correct(x, covariance, z, noise)
@@ -247,7 +256,7 @@ def _shared(covariance: FloatArray, prior: FloatArray, noise: FloatArray) -> tup
 def _bounded(covariance: FloatArray, most: FloatArray) -> FloatArray:
     """Rows and columns scaled down where a variance exceeds ``most``: a congruence, so the matrix stays positive."""
     variance = np.diagonal(covariance, axis1=2, axis2=3)
-    scale = np.sqrt(np.minimum(1.0, most / np.maximum(variance, np.finfo(np.float64).tiny)))
+    scale = np.sqrt(most / np.maximum(variance, most))
     return np.asarray(covariance * scale[..., :, None] * scale[..., None, :])
 
 

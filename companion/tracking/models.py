@@ -36,7 +36,8 @@ HAS_BLOCK = HAS[:, :, None] * HAS[:, None, :]  # (3, 10, 10)
 HAS_BLOCK.flags.writeable = False
 
 TURN_LIMIT_RAD_S = 10.0  # no obstacle of interest turns faster; keeps an absurd fix from winding CT up
-_SERIES_BELOW_RAD = 1e-3
+_SERIES_BELOW_RAD = 1e-2
+_SLOPE_SERIES = (1 / 2, 1 / 3, 1 / 8, 1 / 30, 1 / 144, 1 / 840)  # n / (n + 1)!
 _ORDER = 5  # highest power of dt in F and Q
 _EXPONENTS = np.arange(_ORDER + 1.0)
 # (re, im) of two complex factors -> their 2x2 matrices [[re, -im], [im, re]], row-major
@@ -55,6 +56,8 @@ class MotionModels:
 
     polynomials: FloatArray  # (6, 600): coefficients of dt^n of F (CT's rotation left out) and Q (its turn noise too)
     turn_psd: float  # [rad^2/s^3]
+    accel_decay_hz: float  # 1 / accel_memory_s in predictions, 0: an acceleration lasts
+    jerk_psd: float  # [m^2/s^5]
     prediction_noise: FloatArray  # (3, 6): coefficient of dt^n of each model's predicted position variance
 
 
@@ -90,7 +93,13 @@ def build_models(config: TrackingConfig) -> MotionModels:
         prediction[CA, 5] = rate / 20.0
         turn_psd = 0.0
     flat = (_ORDER + 1, _FLAT)
-    return MotionModels(np.hstack((transition.reshape(flat), noise.reshape(flat))), turn_psd, prediction)
+    return MotionModels(
+        polynomials=np.hstack((transition.reshape(flat), noise.reshape(flat))),
+        turn_psd=turn_psd,
+        accel_decay_hz=1.0 / config.accel_memory_s if config.accel_memory_s > 0.0 else 0.0,
+        jerk_psd=config.jerk_psd_ca,
+        prediction_noise=prediction,
+    )
 
 
 def _integrated_white(noise: FloatArray, chain: tuple[int, ...], density: float) -> None:
@@ -109,8 +118,8 @@ def _integrated_white(noise: FloatArray, chain: tuple[int, ...], density: float)
 def turn_terms(turn: FloatArray, dt: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """E = e^(i Omega dt), I = (E - 1) / (i Omega) and dI/dOmega = (dt E - I) / Omega, horizontal plane as complex.
 
-    With w = v_x + i v_y a turning obstacle obeys p' = p + I w and v' = E w, which is (17). Below |Omega dt| = 1e-3
-    the quotients are taken from their series, whose first neglected terms are below 1e-13 of the result.
+    With w = v_x + i v_y a turning obstacle obeys p' = p + I w and v' = E w, which is (17). Below |Omega dt| = 1e-2
+    the quotients are taken from their series, whose first neglected terms are below 1e-15.
     Shapes: ``turn`` and ``dt`` broadcast.
     """
     angle = turn * dt
@@ -124,8 +133,8 @@ def turn_terms(turn: FloatArray, dt: FloatArray) -> tuple[ComplexArray, ComplexA
     slope = (dt * rotation - integral) / safe
     j = 1j * angle[small]
     duration = np.broadcast_to(dt, angle.shape)[small]
-    integral[small] = duration * (1.0 + j / 2.0 * (1.0 + j / 3.0 * (1.0 + j / 4.0)))
-    slope[small] = 1j * duration * duration * (0.5 + j * (1.0 / 3.0 + j * (0.125 + j / 30.0)))
+    integral[small] = duration * (1.0 + j / 2.0 * (1.0 + j / 3.0 * (1.0 + j / 4.0 * (1.0 + j / 5.0 * (1.0 + j / 6.0)))))
+    slope[small] = 1j * duration * duration * np.polynomial.polynomial.polyval(j, _SLOPE_SERIES)
     return rotation, integral, slope
 
 

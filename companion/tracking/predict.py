@@ -11,25 +11,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from companion.tracking.models import CT, MODELS, SIZE, TURN, MotionModels, horizontal_velocity, turn_terms
+from companion.tracking.models import CA, CT, MODELS, SIZE, TURN, MotionModels, horizontal_velocity, turn_terms
 from companion.types import FloatArray
 
 _DIAGONAL = slice(0, 9, 4)  # of a flattened 3x3
 
 
-def _polynomial_map() -> FloatArray:
-    """(100, 45): a covariance over [p, v, a] -> the coefficients of tau^0 .. tau^4 of P(tau), each 3x3.
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
-    With f = (1, tau, tau^2 / 2) the position's covariance is sum_ij f_i f_j P_ij over the 3x3 blocks.
+
+def _pair_map() -> FloatArray:
+    """(100, 54): a covariance over [p, v, a] -> its blocks summed by pairs, (6, 3, 3).
+
+    A position error moves as f_0 dp + f_1 dv + f_2 da, so its covariance is the sum of f_i f_j (P_ij + P_ij^T) over
+    the pairs i < j, and of f_i^2 P_ii.
     """
-    scale = (1.0, 1.0, 0.5)
-    out = np.zeros((SIZE, SIZE, 5, 3, 3))
-    for i in range(3):
-        for j in range(3):
-            for row in range(3):
-                for column in range(3):
-                    out[3 * i + row, 3 * j + column, i + j, row, column] += scale[i] * scale[j]
-    return out.reshape(SIZE * SIZE, 45)
+    out = np.zeros((SIZE, SIZE, len(_PAIRS), 3, 3))
+    for k, (i, j) in enumerate(_PAIRS):
+        for row in range(3):
+            for column in range(3):
+                out[3 * i + row, 3 * j + column, k, row, column] = 1.0
+                out[3 * j + row, 3 * i + column, k, row, column] = 1.0
+    return out.reshape(SIZE * SIZE, 9 * len(_PAIRS))
 
 
 def _complex_map() -> FloatArray:
@@ -46,7 +49,8 @@ def _complex_map() -> FloatArray:
     return np.ascontiguousarray(out).reshape(SIZE * SIZE, 24).view(np.float64)
 
 
-_POLYNOMIAL_MAP = _polynomial_map()
+_PAIR_MAP = _pair_map()
+_FIRST, _SECOND = np.array(_PAIRS).T
 _COMPLEX_MAP = _complex_map()
 
 
@@ -61,20 +65,38 @@ def predict_positions(
         p_enu (M, K, 3) [m] and covariance (M, K, 3, 3) [m^2], spread of means included.
     """
     tracks, steps = x.shape[0], tau_s.shape[0]
-    powers = tau_s[:, None] ** np.arange(6.0)  # (K, 6)
+    reach, noise = grid(tau_s, models)
     p = np.empty((tracks, MODELS, steps, 3))
     spread = np.empty((tracks, MODELS, steps, 9))
-    np.matmul(powers[:, :3] * (1.0, 1.0, 0.5), x[:, :CT, :9].reshape(tracks, CT, 3, 3), out=p[:, :CT])
-    terms = covariance[:, :CT].reshape(tracks, CT, SIZE * SIZE) @ _POLYNOMIAL_MAP
-    np.matmul(powers[:, :5], terms.reshape(tracks, CT, 5, 9), out=spread[:, :CT])
+    np.matmul(reach, x[:, :CT, :9].reshape(tracks, CT, 3, 3), out=p[:, :CT])
+    blocks = (covariance[:, :CT].reshape(tracks, CT, SIZE * SIZE) @ _PAIR_MAP).reshape(tracks, CT, len(_PAIRS), 9)
+    np.matmul(reach[:, _FIRST] * reach[:, _SECOND], blocks, out=spread[:, :CT])
     _turning(x, covariance, tau_s, models.turn_psd, p[:, CT], spread[:, CT])
-    spread[..., _DIAGONAL] += (models.prediction_noise @ powers.T)[:, :, None]
+    spread[..., _DIAGONAL] += noise[:, :, None]
     weights = probabilities[:, None, :]
     fused = (weights @ p.reshape(tracks, MODELS, steps * 3)).reshape(tracks, steps, 3)
     offset = p - fused[:, None]
     spread += (offset[..., :, None] * offset[..., None, :]).reshape(spread.shape)
     total = (weights @ spread.reshape(tracks, MODELS, steps * 9)).reshape(tracks, steps, 3, 3)
     return fused, total
+
+
+def grid(tau_s: FloatArray, models: MotionModels) -> tuple[FloatArray, FloatArray]:
+    """What position, velocity and acceleration contribute after tau, (K, 3), and each model's own noise, (3, K) [m^2].
+
+    An acceleration with a memory T = 1 / alpha dies out as it is carried on: it moves the obstacle by
+    phi(tau) = (alpha tau - 1 + e^(-alpha tau)) / alpha^2, tau^2 / 2 where alpha is zero, and white jerk of density q
+    leaves q times the integral of phi^2.
+    """
+    noise = models.prediction_noise @ (tau_s[:, None] ** np.arange(6.0)).T
+    alpha = models.accel_decay_hz
+    if alpha == 0.0:
+        return np.stack((np.ones_like(tau_s), tau_s, 0.5 * tau_s * tau_s), axis=1), noise
+    aged, left = alpha * tau_s, np.exp(-alpha * tau_s)
+    phi = (aged - 1.0 + left) / alpha**2
+    noise[CA] = (((aged - 1.0) ** 3 + 1.0) / 3.0 - 2.0 * aged * left + 0.5 * (1.0 - left * left)) / alpha**5
+    noise[CA] *= models.jerk_psd
+    return np.stack((np.ones_like(tau_s), tau_s, phi), axis=1), noise
 
 
 def _turning(
