@@ -181,23 +181,30 @@ class Pilot:
         if inputs.task is not self._task:
             self._task, self._anchor = inputs.task, None
         config, limit = self._config.policy, self._reserve_limit()
-        v = inputs.vehicle.v_enu
+        p, v = inputs.vehicle.p_enu, inputs.vehicle.v_enu
         if inputs.task is Task.STAY:
             return frozen(brake(v_act, config, limit)), True
-        if inputs.task is Task.FLY:
-            if self._anchor is None:
-                self._anchor = inputs.vehicle.p_enu
-            goal = self._anchor if inputs.target_enu is None else inputs.target_enu
-            try:
-                action = self._policy.act(v, goal - inputs.vehicle.p_enu)
-                return frozen(np.clip(action, -limit, limit)), True
-            except PolicyOutputInvalid:
-                return frozen(brake(v_act, config, limit)), False
-        if self._anchor is None and float(np.linalg.norm(v)) < HOLD_SPEED_M_S:
-            self._anchor = inputs.vehicle.p_enu
+        if inputs.task is Task.HOLD:
+            if self._anchor is None and float(np.linalg.norm(v)) < HOLD_SPEED_M_S:
+                self._anchor = p
+            anchor = self._anchor
+            a_ref = brake(v_act, config, limit) if anchor is None else hold(anchor - p_act, v_act, config, limit)
+            # the policy is still asked, so that a HOLD which its output caused ends when it is sound again
+            return frozen(a_ref), inputs.target_enu is None or self._ask(v, inputs.target_enu - p) is not None
         if self._anchor is None:
-            return frozen(brake(v_act, config, limit)), True
-        return frozen(hold(self._anchor - p_act, v_act, config, limit)), True
+            self._anchor = p
+        goal = self._anchor if inputs.target_enu is None else inputs.target_enu
+        action = self._ask(v, goal - p)
+        if action is None:
+            return frozen(brake(v_act, config, limit)), False
+        return frozen(np.clip(action, -limit, limit)), True
+
+    def _ask(self, v_enu: Vec3, error_enu: Vec3) -> Vec3 | None:
+        """The policy's acceleration, None where its output is not usable."""
+        try:
+            return self._policy.act(v_enu, error_enu)
+        except PolicyOutputInvalid:
+            return None
 
     def _filtered(
         self,

@@ -1,0 +1,212 @@
+"""The brain in one call: order, delay, tasks, determinism."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.config import Config, parse_config
+from companion.errors import BrainFailure, PolicyOutputInvalid
+from companion.pilot import Pilot, PilotInput, PilotOutput, Task
+from companion.types import (
+    Detection,
+    DetectionFrame,
+    DetectionKind,
+    FloatArray,
+    Vec3,
+    VehicleState,
+    Verdict,
+    frozen,
+)
+
+TICK_NS = 50_000_000
+
+
+class Straight:
+    """A policy that always wants the same acceleration; ``broken`` makes its output invalid."""
+
+    def __init__(self, a: list[float]) -> None:
+        self.a = np.array(a)
+        self.broken = False
+        self.asked: list[tuple[Vec3, Vec3]] = []
+
+    def act(self, v_enu: Vec3, error_enu: Vec3) -> FloatArray:
+        self.asked.append((v_enu, error_enu))
+        if self.broken:
+            raise PolicyOutputInvalid("nan")
+        return self.a
+
+
+def pilot(policy: Any, **sections: dict[str, Any]) -> Pilot:
+    return Pilot(parse_config({"disturbance": {"enabled": False}, **sections}), policy)
+
+
+def vehicle(k: int, p: list[float], v: list[float] = [0, 0, 0]) -> VehicleState:  # noqa: B006 - never written to
+    return VehicleState(k * TICK_NS, frozen(p), frozen(v))
+
+
+def ball(k: int, p: list[float]) -> DetectionFrame:
+    seen = Detection("ball", frozen(p), 0.2, p_std_m=0.05)
+    return DetectionFrame(k * TICK_NS, "radar", k, DetectionKind.DETECTION, (seen,))
+
+
+def fly(brain: Pilot, ticks: int, **options: Any) -> list[PilotOutput]:
+    """A vehicle that does as it is told, towards a ball in its way."""
+    outputs = []
+    p, v = np.array([0.0, 0.0, 2.0]), np.zeros(3)
+    for k in range(ticks):
+        inputs = PilotInput(
+            vehicle(k, p.tolist(), v.tolist()), (ball(k, [6.0, 0.02, 2.0]),), Task.FLY, frozen([9, 0, 2])
+        )
+        outputs.append(brain.step(inputs, **options))
+        p = p + v * 0.05
+        v = v + outputs[-1].wire * 0.05
+    return outputs
+
+
+def test_an_obstacle_in_the_way_is_avoided_and_the_verdict_says_so() -> None:
+    outputs = fly(pilot(Straight([2.0, 0.0, 0.0])), 60)
+    verdicts = {output.result.verdict for output in outputs}
+    assert outputs[0].result.verdict is Verdict.NOMINAL
+    assert Verdict.ADJUSTED in verdicts
+    first = next(output for output in outputs if output.result.verdict is Verdict.ADJUSTED)
+    assert first.result.worst is not None
+    assert first.result.worst.track == "radar/ball"
+    assert not np.array_equal(first.result.a_safe, first.u_ref)
+
+
+def test_a_nominal_answer_is_the_reference_to_the_bit() -> None:
+    for output in fly(pilot(Straight([0.1, 0.2, 0.3])), 10):
+        assert output.result.verdict is Verdict.NOMINAL
+        assert output.result.a_safe.tobytes() == np.array([0.1, 0.2, 0.3]).tobytes()
+        assert output.wire.tobytes() == output.result.a_safe.tobytes()
+
+
+def test_reset_repeats_the_flight_to_the_bit() -> None:
+    brain = pilot(Straight([2.0, 0.0, 0.0]))
+    first = fly(brain, 50)
+    brain.reset()
+    for a, b in zip(first, fly(brain, 50), strict=True):
+        assert a.wire.tobytes() == b.wire.tobytes()
+        assert a.prediction.p_enu.tobytes() == b.prediction.p_enu.tobytes()
+        assert a.result.verdict is b.result.verdict
+
+
+def test_filter_none_passes_the_reference() -> None:
+    for output in fly(pilot(Straight([2.0, 0.0, 0.0]), safety={"filter": "none"}), 60):
+        np.testing.assert_array_equal(output.result.a_safe, [2.0, 0.0, 0.0])
+        assert output.result.solver == "none"
+
+
+def test_prediction_starts_when_the_setpoint_acts() -> None:
+    brain = pilot(Straight([0.0, 0.0, 0.0]), delay={"loop_s": 0.02, "actuation_s": 0.08})
+    output = brain.step(PilotInput(vehicle(4, [0, 0, 2]), (ball(4, [6, 0, 2]),)))
+    assert output.prediction.start_ns == 4 * TICK_NS + 100_000_000
+    assert output.prediction.p_enu.shape == (1, 23, 3)
+
+
+def test_vehicle_is_predicted_under_the_commands_already_given() -> None:
+    """Dead time of two ticks: the commands of the last two ticks are still to act, one after the other."""
+    policy = Straight([1.0, 0.0, 0.0])
+    brain = pilot(policy, delay={"loop_s": 0.0, "actuation_s": 0.1})
+    p, v = np.array([0.0, 0.0, 2.0]), np.array([1.0, 0.0, 0.0])
+    brain.step(PilotInput(vehicle(0, p.tolist(), v.tolist())))
+    policy.a = np.array([3.0, 0.0, 0.0]) * 0.5
+    brain.step(PilotInput(vehicle(1, [0.05, 0, 2], v.tolist())))
+    p_act, v_act = brain._at_action(vehicle(2, [0.1, 0, 2], v.tolist()))
+    # 1.0 m/s^2 for 0.05 s, then 1.5 m/s^2 for 0.05 s
+    v1 = 1.0 + 1.0 * 0.05
+    expected = 0.1 + 1.0 * 0.05 + 0.5 * 1.0 * 0.05**2 + v1 * 0.05 + 0.5 * 1.5 * 0.05**2
+    np.testing.assert_allclose(p_act, [expected, 0, 2], atol=1e-12)
+    np.testing.assert_allclose(v_act, [v1 + 1.5 * 0.05, 0, 0], atol=1e-12)
+
+
+def test_before_the_first_command_the_vehicle_coasts() -> None:
+    brain = pilot(Straight([1.0, 0.0, 0.0]), delay={"actuation_s": 0.1})
+    p_act, v_act = brain._at_action(vehicle(0, [0, 0, 2], [2, 0, 0]))
+    np.testing.assert_allclose(p_act, [0.2, 0, 2])
+    np.testing.assert_allclose(v_act, [2, 0, 0])
+
+
+def test_what_is_not_sent_is_not_commanded() -> None:
+    brain = pilot(Straight([2.0, 0.0, 0.0]), delay={"actuation_s": 0.1})
+    brain.step(PilotInput(vehicle(0, [0, 0, 2])), sent=False)
+    _, v_act = brain._at_action(vehicle(1, [0, 0, 2], [0, 0, 0]))
+    np.testing.assert_array_equal(v_act, [0, 0, 0])
+
+
+def test_an_invalid_policy_brakes_and_says_so() -> None:
+    policy = Straight([2.0, 0.0, 0.0])
+    brain = pilot(policy)
+    policy.broken = True
+    output = brain.step(PilotInput(vehicle(0, [0, 0, 2], [1, 0, 0]), target_enu=frozen([5, 0, 2])))
+    assert not output.policy_valid
+    assert output.u_ref[0] < 0.0
+    held = brain.step(PilotInput(vehicle(1, [0, 0, 2], [1, 0, 0]), task=Task.HOLD, target_enu=frozen([5, 0, 2])))
+    assert not held.policy_valid
+    policy.broken = False
+    assert brain.step(
+        PilotInput(vehicle(2, [0, 0, 2], [1, 0, 0]), task=Task.HOLD, target_enu=frozen([5, 0, 2]))
+    ).policy_valid
+
+
+def test_without_a_target_it_holds_where_it_was_engaged() -> None:
+    policy = Straight([0.0, 0.0, 0.0])
+    brain = pilot(policy)
+    brain.step(PilotInput(vehicle(0, [1, 1, 2])))
+    brain.step(PilotInput(vehicle(1, [1.5, 1, 2])))
+    np.testing.assert_allclose(policy.asked[1][1], [-0.5, 0, 0])
+
+
+def test_hold_brakes_then_anchors() -> None:
+    brain = pilot(Straight([0.0, 0.0, 0.0]), delay={"actuation_s": 0.0})
+    braking = brain.step(PilotInput(vehicle(0, [0, 0, 2], [2, 0, 0]), task=Task.HOLD))
+    assert braking.u_ref[0] < -2.0
+    brain.step(PilotInput(vehicle(1, [1, 0, 2], [0.1, 0, 0]), task=Task.HOLD))
+    back = brain.step(PilotInput(vehicle(2, [1.5, 0, 2], [0, 0, 0]), task=Task.HOLD))
+    assert back.u_ref[0] < 0.0  # drifted off the anchor at x = 1
+    np.testing.assert_array_equal(back.u_ref[1:], [0, 0])
+
+
+def test_stay_never_pulls_back() -> None:
+    brain = pilot(Straight([2.0, 0.0, 0.0]))
+    brain.step(PilotInput(vehicle(0, [0, 0, 0.2]), task=Task.STAY))
+    output = brain.step(PilotInput(vehicle(1, [5, 0, 0.2]), task=Task.STAY))
+    assert not output.u_ref.any()
+    assert output.result.verdict is Verdict.NOMINAL  # floor and arena rows are off on the ground
+
+
+@pytest.mark.parametrize("bad", [[np.nan, 0, 2], [0, np.inf, 2]])
+def test_a_vehicle_state_that_is_not_finite_is_a_failure(bad: list[float]) -> None:
+    brain = pilot(Straight([0.0, 0.0, 0.0]))
+    with pytest.raises(BrainFailure, match="finite"):
+        brain.step(PilotInput(vehicle(0, bad)))
+
+
+def test_time_must_advance() -> None:
+    brain = pilot(Straight([0.0, 0.0, 0.0]))
+    brain.step(PilotInput(vehicle(5, [0, 0, 2])))
+    with pytest.raises(BrainFailure, match="stamp"):
+        brain.step(PilotInput(vehicle(5, [0, 0, 2])))
+
+
+def test_the_reserve_for_the_disturbance_is_kept() -> None:
+    config = parse_config({"disturbance": {"bound_m_s2": 0.4}})
+    brain = Pilot(config, Straight([3.0, 3.0, -3.0]))  # type: ignore[arg-type]
+    output = brain.step(PilotInput(vehicle(0, [0, 0, 5])))
+    np.testing.assert_allclose(output.u_ref, [2.6, 2.6, -2.6])
+    assert np.abs(output.wire).max() <= Config().limits.acceleration_m_s2
+
+
+def test_a_constant_push_is_taken_off_the_wire() -> None:
+    policy = Straight([0.0, 0.0, 0.0])
+    brain = Pilot(parse_config({"delay": {"actuation_s": 0.0}}), policy)  # type: ignore[arg-type]
+    v, wire = np.zeros(3), np.zeros(3)
+    for k in range(200):
+        output = brain.step(PilotInput(vehicle(k, [0, 0, 5], v.tolist())))
+        wire = output.wire
+        v = v + (wire + np.array([0.2, 0.0, -0.1])) * 0.05
+    np.testing.assert_allclose(wire, [-0.2, 0.0, 0.1], atol=0.02)
+    np.testing.assert_array_equal(output.result.a_safe, [0, 0, 0])
