@@ -73,18 +73,18 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     preset: Literal["default", "paper"] = "default"
     dt_s: Positive = 0.05  # the grid for which per-step constants are stated
-    accel_psd_cv: Positive = 0.004  # white acceleration PSD of CV [m^2/s^3]
-    jerk_psd_ca: Positive = 57.0  # white jerk PSD of CA [m^2/s^5]
-    accel_psd_ct: Positive = 0.37  # white acceleration PSD of CT [m^2/s^3]
-    accel_memory_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.5  # CA's acceleration dies out in predictions; 0: never
-    turn_psd_ct: Positive = 0.03  # white turn acceleration PSD of CT [rad^2/s^3]
+    accel_psd_cv: Positive = 0.6  # white acceleration PSD of CV [m^2/s^3]
+    jerk_psd_ca: Positive = 55.0  # white jerk PSD of CA [m^2/s^5]
+    accel_psd_ct: Positive = 0.0014  # white acceleration PSD of CT [m^2/s^3]
+    accel_memory_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 1.0  # CA's acceleration dies out in predictions; 0: never
+    turn_psd_ct: Positive = 0.0075  # white turn acceleration PSD of CT [rad^2/s^3]
     q_paper: NonNegative = 0.0  # > 0: Q = q_paper I per dt_s for every model (Remark 1)
     measurement_variance_m2: Positive = 0.05  # used where a detection states no position_std (Remark 1)
     force_measurement_variance: bool = False  # True: ignore stated position_std
-    stay_probability: Annotated[float, Meta(gt=0.34, lt=1.0)] = 0.994  # pi_jj per dt_s, the rest shared evenly
+    stay_probability: Annotated[float, Meta(gt=0.34, lt=1.0)] = 0.995  # pi_jj per dt_s, the rest shared evenly
     turn_rate: Literal["state", "window"] = "state"  # of CT: an extended state, or the heading change over turn_window
     turn_window: Annotated[int, Meta(ge=2, le=200)] = 20  # updates
-    turn_std_rad_s: Positive = 1.2  # turn rate of a new track, and what CV and CA know about it
+    turn_std_rad_s: Positive = 1.3  # turn rate of a new track, and what CV and CA know about it
     birth_speed_m_s: Positive = 3.0  # 1-sigma of each velocity axis of a new track
     birth_accel_m_s2: Positive = 3.0  # the same of its acceleration
     jump_sigma: Positive = 10.0  # a named detection farther off is skipped once, then the track restarts there
