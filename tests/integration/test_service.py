@@ -1,0 +1,183 @@
+"""The shell around a brain that misbehaves, and lockstep's guard, in process over real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from companion.clock import SystemClock
+from companion.config import parse_config
+from companion.errors import LockstepStalled
+from companion.pilot import Pilot
+from companion.service import Service, Summary
+from sim_bridge.testing import free_port
+
+pytestmark = pytest.mark.integration
+
+OFFBOARD, HOLD = 6 << 16, 4 << 16 | 3 << 24
+
+
+class Failing:
+    """A brain that works until told otherwise."""
+
+    def __init__(self, config: Any) -> None:
+        self._pilot = Pilot(config)
+        self.fails = False
+        self.resets = 0
+
+    def reset(self) -> None:
+        self.resets += 1
+        self._pilot.reset()
+
+    def tracks(self) -> Any:
+        return self._pilot.tracks()
+
+    def step(self, inputs: Any, *, sent: bool) -> Any:
+        if self.fails:
+            raise ZeroDivisionError("on purpose")
+        return self._pilot.step(inputs, sent=sent)
+
+
+class Autopilot:
+    """The other end of the UDP link."""
+
+    def __init__(self, port: int) -> None:
+        self._address = ("127.0.0.1", port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.setblocking(False)
+        self._mav = dialect.MAVLink(None, 1, 1)
+        self.mode = HOLD
+        self.tick = 0
+        self.received: list[Any] = []
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _send(self, message: Any) -> None:
+        self._socket.sendto(message.pack(self._mav), self._address)
+
+    async def fly(self, ticks: int = 1) -> None:
+        for _ in range(ticks):
+            self.tick += 1
+            self._send(self._mav.heartbeat_encode(2, 12, 1 | 128, self.mode, 4))
+            self._send(self._mav.extended_sys_state_encode(0, 2))
+            self._send(self._mav.attitude_quaternion_encode(50 * self.tick, 1.0, 0, 0, 0, 0, 0, 0))
+            self._send(self._mav.local_position_ned_encode(50 * self.tick, 0, 0, -2, 0, 0, 0))
+            await self.listen()
+
+    async def listen(self) -> None:
+        loop = asyncio.get_running_loop()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(0.05):
+                while True:
+                    data = await loop.sock_recv(self._socket, 4096)
+                    self.received.extend(self._mav.parse_buffer(data) or [])
+
+    def command(self, number: int, param1: float) -> None:
+        self._send(self._mav.command_long_encode(1, 196, number, 0, param1, 0, 0, 0, 0, 0, 0))
+
+    def of(self, kind: str) -> list[Any]:
+        return [m for m in self.received if m.get_type() == kind]
+
+    def mode_requests(self) -> list[tuple[int, int]]:
+        return [(int(m.param2), int(m.param3)) for m in self.of("COMMAND_LONG") if m.command == 176]
+
+
+def run(script: Callable[[Service, Failing, Autopilot], Awaitable[None]], **sections: Any) -> Summary:
+    """Run a service with ``script`` as the world around it."""
+    port = free_port()
+
+    async def both() -> Summary:
+        config = parse_config(
+            {
+                "mavlink": {"url": f"udpin://127.0.0.1:{port}", "system_id": 1},
+                "zenoh": {"listen": [f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"]},
+                **sections,
+            }
+        )
+        brain = Failing(config)
+        service = Service(config, SystemClock(), pilot=brain)  # type: ignore[arg-type]
+        autopilot = Autopilot(port)
+        running = asyncio.create_task(service.run())
+        try:
+            while not autopilot.received and not running.done():  # the port opens when the service is up
+                await autopilot.fly()
+            await script(service, brain, autopilot)
+        finally:
+            service.stop()
+            autopilot.close()
+        return await running
+
+    return asyncio.run(both())
+
+
+async def activate(autopilot: Autopilot) -> None:
+    await autopilot.fly(3)
+    autopilot.command(92, 1.0)
+    while not autopilot.mode_requests():
+        await autopilot.fly()
+    assert autopilot.mode_requests()[0] == (6, 0)
+    autopilot.mode = OFFBOARD
+    await autopilot.fly(3)
+
+
+def test_a_failed_brain_means_fault_silence_and_a_request_for_hold() -> None:
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        await activate(autopilot)
+        brain.fails = True
+        await autopilot.fly(1)
+        autopilot.received.clear()
+        await autopilot.fly(5)
+        assert autopilot.of("SET_POSITION_TARGET_LOCAL_NED") == []
+        brain.fails = False
+        await autopilot.fly(25)
+        assert (4, 3) in autopilot.mode_requests()
+        assert {m.system_status for m in autopilot.of("HEARTBEAT")} == {5}  # MAV_STATE_CRITICAL
+        assert autopilot.of("SET_POSITION_TARGET_LOCAL_NED") == []  # FAULT does not heal in flight
+        assert brain.resets == 1
+
+    summary = run(script)
+    assert summary.final_state == "FAULT"
+    assert summary.verdicts["silent"] >= 30
+
+
+def test_a_stop_in_flight_hands_the_vehicle_back_first() -> None:
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        await activate(autopilot)
+        autopilot.received.clear()
+        service.stop()
+        while not autopilot.mode_requests():
+            await autopilot.fly()
+        assert autopilot.mode_requests()[0] == (4, 3)
+        assert autopilot.of("SET_POSITION_TARGET_LOCAL_NED")  # it streams until the mode is seen
+        autopilot.mode = HOLD
+        await autopilot.fly(2)
+
+    assert run(script).final_state == "READY"
+
+
+def test_unknown_and_foreign_traffic_is_ignored() -> None:
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        autopilot.command(31_000, 0.0)
+        await autopilot.fly(3)
+        assert [(m.command, m.result) for m in autopilot.of("COMMAND_ACK")] == [(31_000, 3)]
+
+    assert run(script).final_state == "READY"
+
+
+def test_lockstep_names_the_source_that_is_missing() -> None:
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        autopilot.received.clear()
+        await autopilot.fly(1)
+        for _ in range(60):
+            await autopilot.listen()
+
+    with pytest.raises(LockstepStalled, match="marker of radar"):
+        run(script, sync="lockstep", lockstep_sources=["radar"])
