@@ -75,11 +75,13 @@ class VehicleLimits:
 
 
 def braking_speed(distance_m: float, braking_m_s2: float, dt_s: float) -> float:
-    """Largest speed that stops within ``distance_m``: v^2 / (2 a) + v dt / 2 = d; towards the inside where d < 0."""
-    if distance_m < 0.0:
-        return RETURN_RATE_HZ * distance_m
+    """Largest speed that stops within ``distance_m``: v^2 / (2 a) + v dt / 2 = d; towards the inside where d < 0.
+
+    The way back is no faster than what stops within |d|: the bounds of two opposite walls never cross.
+    """
     half = 0.5 * braking_m_s2 * dt_s
-    return math.sqrt(half * half + 2.0 * braking_m_s2 * distance_m) - half
+    stops = math.sqrt(half * half + 2.0 * braking_m_s2 * abs(distance_m)) - half
+    return stops if distance_m >= 0.0 else -min(-RETURN_RATE_HZ * distance_m, stops)
 
 
 def vehicle_limits(
@@ -96,10 +98,8 @@ def vehicle_limits(
             up = braking_speed(config.arena_max[axis] - ahead, BRAKING_SHARE * box, dt_s)
             down = braking_speed(ahead - config.arena_min[axis], BRAKING_SHARE * box, dt_s)
             arena_low[axis], arena_high[axis] = (-down - v) / dt_s, (up - v) / dt_s
-            least, most = min(max(arena_low[axis], -box), box), min(max(arena_high[axis], -box), box)
-            if least > most:  # an arena narrower than a braking distance
-                least = most = 0.5 * (least + most)
-            low[axis], high[axis] = least, most
+            low[axis] = min(max(arena_low[axis], -box), box)
+            high[axis] = min(max(arena_high[axis], -box), box)
     return VehicleLimits(
         box_m_s2=box,
         low=np.array(low),

@@ -75,12 +75,17 @@ def test_arena_off_leaves_the_box() -> None:
     assert limits.admits(np.array([1.0, 0.0, -1.0]))
 
 
-def test_an_arena_narrower_than_a_braking_distance_leaves_one_answer() -> None:
-    tight = LimitsConfig(arena_min=(-0.01, -10.0, 0.3), arena_max=(0.01, 10.0, 10.0))
-    limits = vehicle_limits(
-        np.array([0.0, 0.0, 5.0]), np.array([0.5, 0.0, 0.0]), tight, arena_on=True, shrink_m_s2=0.0, dt_s=0.05
-    )
-    assert (limits.low <= limits.high).all()
+def test_bounds_of_opposite_walls_never_cross() -> None:
+    """Arenas down to a centimetre, boxes down to nothing, far outside and fast: low <= high all the same."""
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        width = 10.0 ** rng.uniform(-2.0, 1.0)
+        arena = LimitsConfig(arena_min=(-width, -width, 0.3), arena_max=(width, width, 0.3 + width))
+        shrink = float(rng.choice([0.0, 2.9, 3.0]))
+        limits = vehicle_limits(
+            rng.uniform(-20.0, 20.0, 3), rng.normal(0.0, 4.0, 3), arena, arena_on=True, shrink_m_s2=shrink, dt_s=0.05
+        )
+        assert (limits.low <= limits.high).all()
 
 
 def test_speed_limit_is_the_norm_after_the_step() -> None:
