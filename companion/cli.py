@@ -20,7 +20,8 @@ _EPILOG = """\
 examples:
   companion demo                              fly the simulated vehicle through crossing obstacles
   companion run -c configs/default.toml       the daemon, beside an autopilot
-  companion publish --source radar --orbit    publish a synthetic obstacle
+  companion publish --orbit "center=1,2,1.5 radius=2 speed=1.5" --connect tcp/127.0.0.1:7447
+                                              publish a made-up obstacle
 """
 
 

@@ -33,4 +33,9 @@ class TickMeter:
         if not values:
             return {}
         p50, p99, p999 = np.quantile(values, [0.5, 0.99, 0.999])
-        return {"p50": round(float(p50), 4), "p99": round(float(p99), 4), "p99.9": round(float(p999), 4), "max": round(max(values), 4)}
+        return {
+            "p50": round(float(p50), 4),
+            "p99": round(float(p99), 4),
+            "p99.9": round(float(p999), 4),
+            "max": round(max(values), 4),
+        }

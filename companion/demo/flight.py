@@ -83,10 +83,11 @@ async def fly(plan: FlightPlan, on_progress: Callable[[str], None]) -> FlightRes
     sim_words += ["--onboard-port", str(onboard), "--gcs-port", str(gcs), "--zenoh-listen", endpoint]
     sim_words += ["--trace", str(trace), *(["--lockstep"] if plan.lockstep else [])]
     sim_words += [] if plan.obstacles else ["--no-obstacles"]
+    operator_words = ["companion.demo.operator", str(gcs), *(str(x) for x in plan.target)]
     async with (
         _Process(sim_words, plan.folder / "sim-bridge.log") as simulator,
         _Process(daemon_words, plan.folder / "companion.log") as daemon,
-        _Process(["companion.demo.operator", str(gcs)], plan.folder / "operator.log", on_line=on_progress) as operator,
+        _Process(operator_words, plan.folder / "operator.log", on_line=on_progress) as operator,
     ):
         simulated = await _until_flown(simulator, daemon, operator)
         answered = _parsed(await daemon.stop(), daemon)

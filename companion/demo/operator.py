@@ -1,8 +1,8 @@
 """The operator of the demo: MAVSDK on the simulator's ground station link, as a person with a ground station would.
 
-Run as a process of its own (``python -m companion.demo.operator PORT``), because MAVSDK cannot be left while one of
-its calls waits for an answer. Prints each step as it begins; exit status 1 and one line on standard error if one
-fails. Never MAVSDK's Offboard plugin: it streams setpoints of its own beside the daemon's.
+Run as a process of its own (``python -m companion.demo.operator PORT X Y Z``), because MAVSDK cannot be left while
+one of its calls waits for an answer. Prints each step as it begins; exit status 1 and one line on standard error if
+one fails. Never MAVSDK's Offboard plugin: it streams setpoints of its own beside the daemon's.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import sys
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +20,7 @@ from companion.errors import CompanionError
 
 CONNECT_S = 15.0
 HOVER_S = 30.0
+WATCH_EVERY = 5  # position updates
 COMPANION_COMPONENT = 196
 _NAV_GUIDED_ENABLE = 92
 
@@ -29,8 +31,10 @@ class OperatorError(CompanionError):
     """A step of the operator that failed; the message names the step."""
 
 
-async def take_off_and_engage(gcs_port: int, on_step: Callable[[str], None]) -> None:
-    """Connect, wait for health, arm, take off, wait for the hover, engage the companion.
+async def take_off_and_engage(
+    gcs_port: int, target_enu: tuple[float, float, float], on_step: Callable[[str], None]
+) -> None:
+    """Connect, wait for health, arm, take off, wait for the hover, engage the companion, watch until ended.
 
     Raises:
         OperatorError: a step was refused or timed out.
@@ -47,6 +51,7 @@ async def take_off_and_engage(gcs_port: int, on_step: Callable[[str], None]) -> 
         if system is None:
             raise OperatorError(f"operator: no autopilot on UDP port {gcs_port} within {CONNECT_S:g} s")
         await _fly(system, on_step)
+        await _watch(system, target_enu, on_step)
 
 
 async def _fly(system: Any, on_step: Callable[[str], None]) -> None:
@@ -74,6 +79,21 @@ async def _fly(system: Any, on_step: Callable[[str], None]) -> None:
         await engage(direct)
     except ActionError as error:
         raise OperatorError(f"operator: {step} refused: {error}") from None
+
+
+async def _watch(system: Any, target_enu: tuple[float, float, float], on_step: Callable[[str], None]) -> None:
+    """Tell the distance to the target; goes on until the process is ended."""
+    from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+
+    x, y, z = target_enu
+    count = 0
+    async with contextlib.aclosing(TelemetryAsync(system).subscribe_position_velocity_ned()) as updates:
+        async for update in updates:
+            p = update.position
+            if count % WATCH_EVERY == 0:
+                distance_m = math.dist((p.east_m, p.north_m, -p.down_m), (x, y, z))
+                on_step(f"{distance_m:.1f} m to the target")
+            count += 1
 
 
 async def engage(direct: Any) -> None:
@@ -111,7 +131,7 @@ async def _until(updates: AsyncIterator[T], accept: Callable[[T], bool], step: s
 
 
 def main(arguments: list[str]) -> int:
-    """Fly as the operator on the UDP port given; MAVSDK's own messages go to standard error."""
+    """Fly as the operator on the UDP port given, to the target given; MAVSDK's messages go to standard error."""
     from mavsdk.logging import log_subscribe
 
     def write(level: Any, message: str, file: str | None, line: int) -> bool:
@@ -120,7 +140,8 @@ def main(arguments: list[str]) -> int:
 
     log_subscribe(write)
     try:
-        asyncio.run(take_off_and_engage(int(arguments[0]), lambda step: print(step, flush=True)))
+        port, x, y, z = int(arguments[0]), *(float(word) for word in arguments[1:4])
+        asyncio.run(take_off_and_engage(port, (x, y, z), lambda step: print(step, flush=True)))
     except OperatorError as error:
         print(error, file=sys.stderr)
         return 1
