@@ -36,8 +36,8 @@ HAS_BLOCK = HAS[:, :, None] * HAS[:, None, :]  # (3, 10, 10)
 HAS_BLOCK.flags.writeable = False
 
 TURN_LIMIT_RAD_S = 10.0  # no obstacle of interest turns faster; keeps an absurd fix from winding CT up
-_SERIES_BELOW_RAD = 1e-2
-_SLOPE_SERIES = (1 / 2, 1 / 3, 1 / 8, 1 / 30, 1 / 144, 1 / 840)  # n / (n + 1)!
+_SERIES_BELOW_RAD = 1e-3
+_TINY = float(np.finfo(np.float64).tiny)
 _ORDER = 5  # highest power of dt in F and Q
 _EXPONENTS = np.arange(_ORDER + 1.0)
 # (re, im) of two complex factors -> their 2x2 matrices [[re, -im], [im, re]], row-major
@@ -118,24 +118,22 @@ def _integrated_white(noise: FloatArray, chain: tuple[int, ...], density: float)
 def turn_terms(turn: FloatArray, dt: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
     """E = e^(i Omega dt), I = (E - 1) / (i Omega) and dI/dOmega = (dt E - I) / Omega, horizontal plane as complex.
 
-    With w = v_x + i v_y a turning obstacle obeys p' = p + I w and v' = E w, which is (17). Below |Omega dt| = 1e-2
-    the quotients are taken from their series, whose first neglected terms are below 1e-15.
-    Shapes: ``turn`` and ``dt`` broadcast.
+    With w = v_x + i v_y a turning obstacle obeys p' = p + I w and v' = E w, which is (17). By the half angle
+    h = Omega dt / 2 nothing is lost at small turn rates:
+
+        I = dt sinc(h) e^(ih),   dI/dOmega = i dt^2 e^(ih) (sinc(h) / 2 + i k(h)),   k = (sinc(h) - cos(h)) / (2 h)
+
+    with k = h / 6 - h^3 / 60 below |h| = 1e-3. Shapes: ``turn`` and ``dt`` broadcast.
     """
-    angle = turn * dt
-    rotation = np.exp(1j * angle)
-    small = np.abs(angle) < _SERIES_BELOW_RAD
-    if not small.any():
-        integral = (rotation - 1.0) / (1j * turn)
-        return rotation, integral, (dt * rotation - integral) / turn
-    safe = np.where(small, 1.0, turn)
-    integral = (rotation - 1.0) / (1j * safe)
-    slope = (dt * rotation - integral) / safe
-    j = 1j * angle[small]
-    duration = np.broadcast_to(dt, angle.shape)[small]
-    integral[small] = duration * (1.0 + j / 2.0 * (1.0 + j / 3.0 * (1.0 + j / 4.0 * (1.0 + j / 5.0 * (1.0 + j / 6.0)))))
-    slope[small] = 1j * duration * duration * np.polynomial.polynomial.polyval(j, _SLOPE_SERIES)
-    return rotation, integral, slope
+    h = 0.5 * turn * dt
+    h = np.where(h == 0.0, _TINY, h)
+    sine, cosine = np.sin(h), np.cos(h)
+    sinc = sine / h
+    k = np.where(np.abs(h) < _SERIES_BELOW_RAD, h * (1.0 / 6.0 - h * h / 60.0), (sinc - cosine) / (2.0 * h))
+    half = cosine + 1j * sine
+    integral = dt * sinc * half
+    slope = (dt * dt) * half * (0.5j * sinc - k)
+    return half * half, integral, slope
 
 
 def propagate(

@@ -9,6 +9,8 @@ covariance at the start; CT turns the horizontal velocity as a complex number. M
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from companion.tracking.models import CA, CT, MODELS, SIZE, TURN, MotionModels, horizontal_velocity, turn_terms
@@ -54,25 +56,55 @@ _FIRST, _SECOND = np.array(_PAIRS).T
 _COMPLEX_MAP = _complex_map()
 
 
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """The instants of a prediction and what depends on nothing else; `horizon` makes it, once for many ticks."""
+
+    tau_s: FloatArray  # (K,) after the start, >= 0
+    reach: FloatArray  # (K, 3): what position, velocity and acceleration of CV and CA contribute
+    pairs: FloatArray  # (K, 6): their products, in the order of the pairs
+    noise: FloatArray  # (3, K, 1): position variance of each model's own noise [m^2]
+    turn_noise: FloatArray  # (K,): q tau / 5, the turn rate's wandering as a variance of its constant error
+
+
+def horizon(tau_s: FloatArray, models: MotionModels) -> Horizon:
+    """Constants of the instants ``tau_s``.
+
+    An acceleration with a memory T = 1 / alpha dies out as it is carried on: it moves the obstacle by
+    phi(tau) = (alpha tau - 1 + e^(-alpha tau)) / alpha^2, tau^2 / 2 where alpha is zero, and white jerk of density q
+    leaves q times the integral of phi^2.
+    """
+    noise = models.prediction_noise @ (tau_s[:, None] ** np.arange(6.0)).T
+    alpha = models.accel_decay_hz
+    phi = 0.5 * tau_s * tau_s
+    if alpha > 0.0:
+        aged, left = alpha * tau_s, np.exp(-alpha * tau_s)
+        phi = (aged - 1.0 + left) / alpha**2
+        squared = (((aged - 1.0) ** 3 + 1.0) / 3.0 - 2.0 * aged * left + 0.5 * (1.0 - left * left)) / alpha**5
+        noise[CA] = models.jerk_psd * squared
+    reach = np.stack((np.ones_like(tau_s), tau_s, phi), axis=1)
+    pairs = reach[:, _FIRST] * reach[:, _SECOND]
+    return Horizon(tau_s, reach, pairs, noise[:, :, None], 0.2 * models.turn_psd * tau_s)
+
+
 def predict_positions(
-    x: FloatArray, covariance: FloatArray, probabilities: FloatArray, tau_s: FloatArray, models: MotionModels
+    x: FloatArray, covariance: FloatArray, probabilities: FloatArray, at: Horizon
 ) -> tuple[FloatArray, FloatArray]:
-    """Fused position and its covariance at ``tau_s`` after the instant of ``x``.
+    """Fused position and its covariance at the instants of ``at``, counted from that of ``x``.
 
     Args:
-        x: (M, 3, 10). covariance: (M, 3, 10, 10). probabilities: (M, 3). tau_s: (K,), >= 0 [s].
+        x: (M, 3, 10). covariance: (M, 3, 10, 10). probabilities: (M, 3).
     Returns:
         p_enu (M, K, 3) [m] and covariance (M, K, 3, 3) [m^2], spread of means included.
     """
-    tracks, steps = x.shape[0], tau_s.shape[0]
-    reach, noise = grid(tau_s, models)
+    tracks, steps = x.shape[0], at.tau_s.shape[0]
     p = np.empty((tracks, MODELS, steps, 3))
     spread = np.empty((tracks, MODELS, steps, 9))
-    np.matmul(reach, x[:, :CT, :9].reshape(tracks, CT, 3, 3), out=p[:, :CT])
+    np.matmul(at.reach, x[:, :CT, :9].reshape(tracks, CT, 3, 3), out=p[:, :CT])
     blocks = (covariance[:, :CT].reshape(tracks, CT, SIZE * SIZE) @ _PAIR_MAP).reshape(tracks, CT, len(_PAIRS), 9)
-    np.matmul(reach[:, _FIRST] * reach[:, _SECOND], blocks, out=spread[:, :CT])
-    _turning(x, covariance, tau_s, models.turn_psd, p[:, CT], spread[:, CT])
-    spread[..., _DIAGONAL] += noise[:, :, None]
+    np.matmul(at.pairs, blocks, out=spread[:, :CT])
+    _turning(x, covariance, at, p[:, CT], spread[:, CT])
+    spread[..., _DIAGONAL] += at.noise
     weights = probabilities[:, None, :]
     fused = (weights @ p.reshape(tracks, MODELS, steps * 3)).reshape(tracks, steps, 3)
     offset = p - fused[:, None]
@@ -81,33 +113,13 @@ def predict_positions(
     return fused, total
 
 
-def grid(tau_s: FloatArray, models: MotionModels) -> tuple[FloatArray, FloatArray]:
-    """What position, velocity and acceleration contribute after tau, (K, 3), and each model's own noise, (3, K) [m^2].
-
-    An acceleration with a memory T = 1 / alpha dies out as it is carried on: it moves the obstacle by
-    phi(tau) = (alpha tau - 1 + e^(-alpha tau)) / alpha^2, tau^2 / 2 where alpha is zero, and white jerk of density q
-    leaves q times the integral of phi^2.
-    """
-    noise = models.prediction_noise @ (tau_s[:, None] ** np.arange(6.0)).T
-    alpha = models.accel_decay_hz
-    if alpha == 0.0:
-        return np.stack((np.ones_like(tau_s), tau_s, 0.5 * tau_s * tau_s), axis=1), noise
-    aged, left = alpha * tau_s, np.exp(-alpha * tau_s)
-    phi = (aged - 1.0 + left) / alpha**2
-    noise[CA] = (((aged - 1.0) ** 3 + 1.0) / 3.0 - 2.0 * aged * left + 0.5 * (1.0 - left * left)) / alpha**5
-    noise[CA] *= models.jerk_psd
-    return np.stack((np.ones_like(tau_s), tau_s, phi), axis=1), noise
-
-
-def _turning(
-    x: FloatArray, covariance: FloatArray, tau_s: FloatArray, turn_psd: float, p: FloatArray, spread: FloatArray
-) -> None:
+def _turning(x: FloatArray, covariance: FloatArray, at: Horizon, p: FloatArray, spread: FloatArray) -> None:
     """CT's positions (M, K, 3) and covariances (M, K, 9), written into ``p`` and ``spread``; isotropic noise left out.
 
     In the complex horizontal plane an error moves as dp(tau) = dp + I dv + (dI/dOmega) w dOmega = f^T u. Its variance
     E|dp|^2 and pseudo-variance E[dp^2] hold the three entries of the horizontal block.
     """
-    tracks, steps = x.shape[0], tau_s.shape[0]
+    tracks, steps, tau_s = x.shape[0], at.tau_s.shape[0], at.tau_s
     _, integral, slope = turn_terms(x[:, CT, TURN, None], tau_s)
     w = horizontal_velocity(x)[:, None]
     move = integral * w
@@ -121,9 +133,9 @@ def _turning(
     ct = covariance[:, CT]
     moments = (ct.reshape(tracks, SIZE * SIZE) @ _COMPLEX_MAP).view(np.complex128).reshape(tracks, 3, 8)
     carried = f @ moments  # (M, K, 8)
-    # the turn rate's own wandering is one more variance on its column: q tau / 5 (see `turn_noise`)
-    carried[..., 2] += column * (0.2 * turn_psd * tau_s)
-    carried[..., 5] += column * (0.2 * turn_psd * tau_s)
+    wandering = column * at.turn_noise
+    carried[..., 2] += wandering
+    carried[..., 5] += wandering
     variance = (carried[..., :3] * f.conj()).sum(axis=-1).real
     pseudo = (carried[..., 3:6] * f).sum(axis=-1)
     cross = carried[..., 6] + carried[..., 7] * tau_s
@@ -141,7 +153,8 @@ def largest_sigma(covariance: FloatArray) -> FloatArray:
     With q = tr / 3, s^2 = tr((C - q I)^2) / 6 and r = det((C - q I) / s) / 2 the largest eigenvalue is
     q + 2 s cos(arccos(r) / 3). Source: Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961.
     """
-    xx, xy, xz, _, yy, yz, _, _, zz = np.moveaxis(covariance.reshape(*covariance.shape[:-2], 9), -1, 0)
+    xx, yy, zz = covariance[..., 0, 0], covariance[..., 1, 1], covariance[..., 2, 2]
+    xy, xz, yz = covariance[..., 0, 1], covariance[..., 0, 2], covariance[..., 1, 2]
     mean = (xx + yy + zz) / 3.0
     a, b, d = xx - mean, yy - mean, zz - mean
     xy2, xz2, yz2 = xy * xy, xz * xz, yz * yz

@@ -18,7 +18,7 @@ from companion.tracking.associate import associate
 from companion.tracking.imm import Bank, birth, build_constants, fuse, fuse_mean, join, put, step
 from companion.tracking.measurement import Measurements, is_finite, measure
 from companion.tracking.models import propagate
-from companion.tracking.predict import largest_sigma, predict_positions
+from companion.tracking.predict import horizon, largest_sigma, predict_positions
 from companion.types import NS_PER_S, Detection, DetectionFrame, DetectionKind, FloatArray, Prediction, TrackTable
 
 IntArray = npt.NDArray[np.int64]
@@ -36,6 +36,8 @@ class Tracker:
         self._config = config
         self._constants = build_constants(config)
         self._coast_ns = round(config.coast_s * NS_PER_S)
+        self._grid = (0, 1.0)  # steps and dt_s of ``_horizon``
+        self._horizon = horizon(np.zeros(0), self._constants.models)
         self.reset()
 
     def reset(self) -> None:
@@ -85,9 +87,11 @@ class Tracker:
     def predict(self, start_ns: int, steps: int, dt_s: float) -> Prediction:
         """Every track at ``start_ns + k dt_s``, k = 0..steps-1 (20)."""
         x, covariance = self._at(start_ns)
-        tau_s = np.arange(float(steps)) * dt_s
+        if (steps, dt_s) != self._grid:
+            self._grid = (steps, dt_s)
+            self._horizon = horizon(np.arange(float(steps)) * dt_s, self._constants.models)
         probabilities = self._bank.probabilities
-        p_enu, spread = predict_positions(x, covariance, probabilities, tau_s, self._constants.models)
+        p_enu, spread = predict_positions(x, covariance, probabilities, self._horizon)
         mean = fuse_mean(x, probabilities)
         return Prediction(
             start_ns=start_ns,

@@ -6,7 +6,7 @@ import pytest
 from companion.config import TrackingConfig, parse_config
 from companion.tracking.imm import birth, build_constants, fuse, step
 from companion.tracking.models import CA, CT, HAS, SIZE, propagate
-from companion.tracking.predict import largest_sigma, predict_positions
+from companion.tracking.predict import horizon, largest_sigma, predict_positions
 
 LASTING = TrackingConfig(accel_memory_s=0.0)
 PAPER = parse_config({"tracking": {"preset": "paper"}}).tracking
@@ -29,7 +29,7 @@ def test_closed_forms_equal_carrying_every_model_on():
     """With a lasting acceleration each instant is one `propagate` and one `fuse`."""
     bank, constants = flown_bank(LASTING)
     tau = np.arange(23.0) * 0.05
-    p, spread = predict_positions(bank.x, bank.covariance, bank.probabilities, tau, constants.models)
+    p, spread = predict_positions(bank.x, bank.covariance, bank.probabilities, horizon(tau, constants.models))
     for k, t in enumerate(tau):
         x, covariance = propagate(bank.x, bank.covariance, np.full(len(bank), t), constants.models)
         mean, expected = fuse(x, covariance, bank.probabilities)
@@ -40,7 +40,9 @@ def test_closed_forms_equal_carrying_every_model_on():
 def test_paper_preset_predicts_means_by_powers_of_the_transition():
     """(20): the mean of each model is (F_j)^i x, fused by the probabilities that the last update left."""
     bank, constants = flown_bank(PAPER)
-    p, _ = predict_positions(bank.x, bank.covariance, bank.probabilities, np.arange(6.0) * 0.05, constants.models)
+    p, _ = predict_positions(
+        bank.x, bank.covariance, bank.probabilities, horizon(np.arange(6.0) * 0.05, constants.models)
+    )
     x, covariance = bank.x, bank.covariance
     for k in range(6):
         expected = (bank.probabilities[:, :, None] * x[..., :3]).sum(axis=1)
@@ -59,7 +61,7 @@ def test_acceleration_noise_is_the_spread_of_sampled_paths(memory_s):
     x[0, CA, :9] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0]
     covariance[0, CA, 6, 6] = 0.25
     alone = np.array([[0.0, 1.0, 0.0]])
-    p, spread = predict_positions(x, covariance, alone, np.array([0.0, 0.5, 1.0]), models)
+    p, spread = predict_positions(x, covariance, alone, horizon(np.array([0.0, 0.5, 1.0]), models))
     position, v, a = np.zeros(runs), np.ones(runs), 2.0 + rng.normal(scale=0.5, size=runs)
     decay = 0.0 if memory_s == 0.0 else 1.0 / memory_s
     for k in range(1, 201):
@@ -83,7 +85,7 @@ def test_turning_spread_is_that_of_sampled_turns():
     covariance[0, CT] = root @ root.T
     tau = np.array([0.0, 0.4, 1.0])
     alone = np.array([[0.0, 0.0, 1.0]])
-    _, spread = predict_positions(x, covariance, alone, tau, models)
+    _, spread = predict_positions(x, covariance, alone, horizon(tau, models))
     sampled = np.repeat(x, 40_000, axis=0)
     sampled[:, CT] += rng.normal(size=(40_000, SIZE)) @ root.T
     for k, t in enumerate(tau):
@@ -96,7 +98,9 @@ def test_spread_of_means_is_part_of_the_covariance():
     models = build_constants(TrackingConfig()).models
     x = np.zeros((1, 3, SIZE))
     x[0, 0, 0], x[0, 1, 0] = -1.0, 1.0
-    _, spread = predict_positions(x, np.zeros((1, 3, SIZE, SIZE)), np.array([[0.5, 0.5, 0.0]]), np.zeros(1), models)
+    _, spread = predict_positions(
+        x, np.zeros((1, 3, SIZE, SIZE)), np.array([[0.5, 0.5, 0.0]]), horizon(np.zeros(1), models)
+    )
     np.testing.assert_allclose(spread[0, 0], np.diag([1.0, 0.0, 0.0]), atol=1e-15)
 
 
@@ -112,6 +116,8 @@ def test_largest_sigma_is_the_root_of_lapacks_largest_eigenvalue():
 def test_no_tracks_predict_to_empty_arrays():
     constants = build_constants(TrackingConfig())
     bank = birth(np.zeros((0, 3)), np.zeros((0, 3, 3)), constants)
-    p, spread = predict_positions(bank.x, bank.covariance, bank.probabilities, np.arange(5.0), constants.models)
+    p, spread = predict_positions(
+        bank.x, bank.covariance, bank.probabilities, horizon(np.arange(5.0), constants.models)
+    )
     assert p.shape == (0, 5, 3)
     assert largest_sigma(spread).shape == (0, 5)
