@@ -141,9 +141,9 @@ def markov(dt: FloatArray, constants: Constants) -> FloatArray:
 
 def mix(bank: Bank, dt: FloatArray, constants: Constants) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Interaction (18): mixed (x0, P0) of each model and its prior probability c (M, 3)."""
-    joint = bank.probabilities[:, :, None] * markov(dt, constants)  # (M, from, to)
-    prior = joint.sum(axis=1)
-    weights = (joint / prior[:, None, :]).swapaxes(1, 2)  # (M, to, from)
+    transitions = markov(dt, constants)
+    prior = (bank.probabilities[:, None, :] @ transitions)[:, 0]
+    weights = (bank.probabilities[:, :, None] * transitions / prior[:, None, :]).swapaxes(1, 2)  # (M, to, from)
     x, covariance = to_common(bank.x, bank.covariance)
     if constants.turn_window == 0:
         # CV and CA know nothing of the turn rate: CT's own estimate stands for theirs, no surer than a new track's
@@ -179,7 +179,7 @@ def correct(
     to_measurement = covariance[..., :d]
     inverse, log_determinant = _invert(covariance[..., :d, :d] + noise[:, None])
     weighted = inverse @ innovation[..., None]
-    nis = (innovation * weighted[..., 0]).sum(axis=-1)
+    nis = (innovation[..., None, :] @ weighted)[..., 0, 0]
     gain = to_measurement @ inverse
     updated = x + (to_measurement @ weighted)[..., 0]
     spread: FloatArray = covariance - gain @ covariance[..., :d, :]

@@ -63,8 +63,9 @@ class Tracker:
         self._now_ns = now_ns
         for frame in sorted(frames, key=lambda frame: frame.order_key):
             self._consume(frame)
-        keep = self._stamp_ns >= now_ns - self._coast_ns
-        if not keep.all():
+        oldest_ns = now_ns - self._coast_ns
+        if self._ids and self._stamp_ns.min() < oldest_ns:
+            keep = self._stamp_ns >= oldest_ns
             self.dropped["lost"] += int(len(self) - keep.sum())
             self._keep(np.flatnonzero(keep))
 
@@ -122,12 +123,14 @@ class Tracker:
         if not rows:
             return
         row_of = np.array(rows, dtype=np.intp)
-        known = row_of >= 0
-        if known.any():
-            self._advance(frame, row_of[known], measurements if known.all() else measurements.take(known))
-        if not known.all():
-            fresh = np.flatnonzero(~known)
-            self._spawn(frame.stamp_ns, [ids[k] for k in fresh], measurements.take(fresh))
+        if min(rows) >= 0:
+            self._advance(frame, row_of, measurements)
+            return
+        known = np.flatnonzero(row_of >= 0)
+        if known.size:
+            self._advance(frame, row_of[known], measurements.take(known))
+        fresh = np.flatnonzero(row_of < 0)
+        self._spawn(frame.stamp_ns, [ids[k] for k in fresh], measurements.take(fresh))
 
     def _named(self, frame: DetectionFrame) -> tuple[list[str], list[Detection]]:
         """Usable named detections, one of each id, in the order of their ids."""
@@ -178,29 +181,39 @@ class Tracker:
     def _advance(self, frame: DetectionFrame, rows: npt.NDArray[np.intp], measurements: Measurements) -> None:
         """Tracks ``rows`` by one measurement each."""
         dt_ns = frame.stamp_ns - self._stamp_ns[rows]
-        usable = dt_ns > 0
-        if not usable.all():
+        if dt_ns.min() <= 0:
             self.dropped["late"] += int((dt_ns < 0).sum())
             self.dropped["duplicate"] += int((dt_ns == 0).sum())
+            usable = np.flatnonzero(dt_ns > 0)
             rows, measurements, dt_ns = rows[usable], measurements.take(usable), dt_ns[usable]
-        for full in (False, True):
-            chosen = np.flatnonzero(measurements.full == full)
-            if chosen.size == len(measurements):
-                self._filter(frame, rows, dt_ns, measurements, full)
-            elif chosen.size:
-                self._filter(frame, rows[chosen], dt_ns[chosen], measurements.take(chosen), full)
+        full = measurements.full.tolist()
+        if not any(full):
+            self._filter(frame, rows, dt_ns, measurements, full=False)
+            return
+        for part in (False, True):
+            chosen = np.flatnonzero(measurements.full == part)
+            self._filter(frame, rows[chosen], dt_ns[chosen], measurements.take(chosen), full=part)
 
     def _filter(
-        self, frame: DetectionFrame, rows: npt.NDArray[np.intp], dt_ns: IntArray, measurements: Measurements, full: bool
+        self,
+        frame: DetectionFrame,
+        rows: npt.NDArray[np.intp],
+        dt_ns: IntArray,
+        measurements: Measurements,
+        *,
+        full: bool,
     ) -> None:
+        """One update of the tracks ``rows``; one far off is skipped once, a second time restarts the track there."""
         if not rows.size:
             return
         z, noise = measurements.parts(full)
-        before = self._bank if _is_all(rows, len(self)) else self._bank.take(rows)
+        everything = rows.tolist() == list(range(len(self)))
+        before = self._bank if everything else self._bank.take(rows)
         foreign = frame.kind is DetectionKind.TRACK
         after, nis = step(before, dt_ns / NS_PER_S, z, noise, self._constants, foreign=foreign)
-        far = nis.min(axis=1) > self._config.jump_sigma**2
-        if far.any():
+        nearest = nis.min(axis=1)
+        if nearest.max() > self._config.jump_sigma**2:
+            far = nearest > self._config.jump_sigma**2
             again = far & self._missed[rows]
             after = put(after, np.flatnonzero(again), birth(z[again], noise[again], self._constants))
             skipped = far & ~again
@@ -208,9 +221,10 @@ class Tracker:
             self._missed[rows] = skipped
             used = np.flatnonzero(~skipped)
             rows, after, measurements = rows[used], after.take(used), measurements.take(used)
+            everything = False
         else:
             self._missed[rows] = False
-        self._bank = after if _is_all(rows, len(self)) else put(self._bank, rows, after)
+        self._bank = after if everything else put(self._bank, rows, after)
         self._stamp_ns[rows] = frame.stamp_ns
         self._radius_m[rows] = measurements.radius_m
         self._carried = None
@@ -243,10 +257,6 @@ class Tracker:
     def _index(self) -> None:
         self._rows = {track_id: row for row, track_id in enumerate(self._ids)}
         self._carried = None
-
-
-def _is_all(rows: npt.NDArray[np.intp], count: int) -> bool:
-    return rows.size == count and bool((rows == np.arange(count)).all())
 
 
 def _read_only(array: FloatArray) -> FloatArray:
