@@ -100,7 +100,7 @@ class PolicyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     backend: Literal["onnx", "torch"] = "onnx"
     capture_radius_m: NonNegative = 0.6  # inside it the documented hold law flies
     hold_kp: NonNegative = 2.0  # [1/s^2]
-    hold_kd: NonNegative = 2.6  # [1/s]
+    hold_kd: NonNegative = 3.0  # [1/s]
 
 
 class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -130,12 +130,12 @@ class Policy:
 
     def action(self, v_enu: Vec3, error_enu: Vec3) -> Vec3:
         """The network alone: pi([v, e]) in [-1, 1]^3, float64."""
-        farthest_m = float(np.abs(error_enu).max())
-        row = self._observation[0]
-        row[:3] = v_enu
-        row[3:] = error_enu if farthest_m <= self._reach_m else error_enu * (self._reach_m / farthest_m)
+        (vx, vy, vz), (ex, ey, ez) = v_enu.tolist(), error_enu.tolist()
+        farthest_m = max(abs(ex), abs(ey), abs(ez))
+        share = 1.0 if farthest_m <= self._reach_m else self._reach_m / farthest_m
+        self._observation[0] = (vx, vy, vz, share * ex, share * ey, share * ez)
         x, y, z = self._network(self._observation)[0].tolist()
-        if not math.isfinite(x + y + z + float(row.sum())):  # a rectifier may swallow a NaN
+        if not math.isfinite(x + y + z + vx + vy + vz + ex + ey + ez):  # a rectifier may swallow a NaN
             raise PolicyOutputInvalid(f"policy {self.manifest.name}: action {[x, y, z]}, expected finite numbers")
         return np.array([min(1.0, max(-1.0, x)), min(1.0, max(-1.0, y)), min(1.0, max(-1.0, z))])
 

@@ -1,8 +1,8 @@
 """The networks of this project in torch: pi(o) = clip(f(o / scale), -1, 1), rebuilt from a safetensors file.
 
 Two kinds, named by ``network.kind`` of the manifest. ``mlp`` is a plain multilayer perceptron. ``axis_shared`` is one
-perceptron g for every axis, made odd: with o_i = [v_i, e_i, sgn(e_i) sqrt|e_i|] and what no rotation of the cube
-changes, s = [|e|, sqrt|e|, |v|, v.e / |e|],
+perceptron g for every axis, made odd: with o_i = [v_i, e_i, 4 e_i / (1 + 4 |e_i|)], the last fine near the target, and
+lengths that no symmetry of the cube changes, s = [|v|, |e|, |v + e|] (speed, distance, the angle between them),
 
     a_i = g(o_i, s) - g(-o_i, s).
 
@@ -30,24 +30,21 @@ except ModuleNotFoundError as error:
     ) from None
 
 Weights = Mapping[str, torch.Tensor]
-AXIS_SHARED_KEYS = frozenset(
-    ("scale", "odd.weight", "even.weight", "even.bias", "hidden.weight", "hidden.bias", "out.weight")
-)
+FINE = 4.0  # slope of the third feature at the target
 
 
-def invariants(v: torch.Tensor, e: torch.Tensor) -> torch.Tensor:
-    """[|e|, sqrt|e|, |v|, v.e / |e|] of (N, 3) tensors: (N, 4)."""
-    distance, speed = e.norm(dim=1, keepdim=True), v.norm(dim=1, keepdim=True)
-    closing = (v * e).sum(dim=1, keepdim=True) / (distance + 1e-3)
-    return torch.cat([distance, distance.sqrt(), speed, closing], dim=1)
+def lengths(v: torch.Tensor, e: torch.Tensor) -> torch.Tensor:
+    """[|v|, |e|, |v + e|] of scaled (N, 3) tensors: (N, 3)."""
+    return torch.stack([v, e, v + e], dim=1).norm(dim=2)
 
 
 def axis_shared(weights: Weights, observation: torch.Tensor) -> torch.Tensor:
     """a_i = g(o_i, s) - g(-o_i, s), before the clip: (N, 6) -> (N, 3)."""
     o = observation / weights["scale"]
     v, e = o[:, :3], o[:, 3:]
-    odd = torch.stack([v, e, e.sign() * e.abs().sqrt()], dim=2) @ weights["odd.weight"].T  # (N, 3, H)
-    even = (invariants(v, e) @ weights["even.weight"].T + weights["even.bias"])[:, None, :]
+    fine = torch.nn.functional.softsign(FINE * e)
+    odd = torch.stack([v, e, fine], dim=2) @ weights["odd.weight"].T  # (N, 3, H)
+    even = (lengths(v, e) @ weights["even.weight"].T + weights["even.bias"])[:, None, :]
     first = torch.relu(torch.stack([even + odd, even - odd]))
     second = torch.relu(first @ weights["hidden.weight"].T + weights["hidden.bias"])
     return ((second[0] - second[1]) @ weights["out.weight"].T)[..., 0]
@@ -71,7 +68,7 @@ def load_network(data: bytes, manifest: Manifest, path: Path) -> Network:
         ArtifactError: not safetensors, a kind that is not known, or tensors that do not fit together.
     """
     try:
-        weights = load(data)
+        weights = {name: value.double() for name, value in load(data).items()}  # as in the ONNX model
     except SafetensorError as error:
         raise ArtifactError(f"{path}: expected safetensors: {error}") from None
     kind, activation = manifest.network.get("kind"), str(manifest.network.get("activation"))
@@ -83,9 +80,10 @@ def load_network(data: bytes, manifest: Manifest, path: Path) -> Network:
 
     def infer(observation: Float32) -> Float32:
         with torch.inference_mode():
-            x = torch.from_numpy(observation)
+            x = torch.from_numpy(observation).double()
             raw = axis_shared(weights, x) if kind == "axis_shared" else mlp(weights, x, activation)
-            return raw.clamp(-1.0, 1.0).numpy()
+            action: Float32 = raw.clamp(-1.0, 1.0).float().numpy()
+            return action
 
     try:
         infer(np.zeros((1, 6), dtype=np.float32))

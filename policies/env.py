@@ -43,8 +43,9 @@ class EnvConfig:
     overspeed_cost: float = 0.0  # per m/s above the limit and second
     start_speed_m_s: float = 0.0  # initial speeds are drawn up to this
     near_share: float = 0.0  # share of episodes whose target is drawn near, log-uniform down to 3 % of the arena
+    wall_share: float = 0.0  # share of episodes whose target has one axis within 0.1 m of a wall: overshoot is felt
     lag_spread_s: float = 0.0  # randomisation: lag uniform within +- of lag_s, per episode
-    gain_spread: float = 0.0  # acceleration obtained over that asked for, uniform within 1 +- of it, per episode
+    gain_loss: float = 0.0  # acceleration obtained over that asked for, uniform in [1 - loss, 1], per episode
     bias_std_m_s2: float = 0.0  # constant acceleration error, per episode and axis
     noise_p_std_m: float = 0.0  # observation noise, per step and axis
     noise_v_std_m_s: float = 0.0
@@ -62,13 +63,15 @@ class EnvConfig:
 
 PRESETS: dict[str, EnvConfig] = {
     "default": EnvConfig(
+        lag_s=0.12,
         terminal_speed_cost=9.0,
-        speed_limit_m_s=5.5,
+        speed_limit_m_s=5.2,
         overspeed_cost=40.0,
-        start_speed_m_s=5.5,
+        start_speed_m_s=5.2,
         near_share=0.5,
-        lag_spread_s=0.05,
-        gain_spread=0.1,
+        wall_share=0.25,
+        lag_spread_s=0.06,
+        gain_loss=0.15,
         bias_std_m_s2=0.1,
     ),
     "paper": EnvConfig(k_ma_m_s2=1.0, segment_test=False, max_steps=400, lag_s=0.0, speed_limit_m_s=1e3),
@@ -174,17 +177,17 @@ class PointMassBatch:
         self.a_enu[mask] = 0.0
         self._queue[:, mask] = 0.0
         self._lag_s[mask] = c.lag_s + rng.uniform(-c.lag_spread_s, c.lag_spread_s, (n, 1))
-        self._gain[mask] = 1.0 + rng.uniform(-c.gain_spread, c.gain_spread, (n, 1))
+        self._gain[mask] = 1.0 - rng.uniform(0.0, c.gain_loss, (n, 1))
         self._bias[mask] = rng.normal(0.0, 1.0, (n, 3)) * c.bias_std_m_s2
         self.steps[mask] = 0
-        return self._observe()
+        return self.observe()
 
     def place(self, p_enu: FloatArray, v_enu: FloatArray, target_enu: FloatArray) -> FloatArray:
         """Start every vehicle from a given state, with nothing on its way: nominal lag and gain, no bias."""
         self.p_enu, self.v_enu, self.target_enu = (np.array(x, dtype=float) for x in (p_enu, v_enu, target_enu))
         self.a_enu[:], self._queue[:], self._bias[:], self.steps[:] = 0.0, 0.0, 0.0, 0
         self._lag_s[:], self._gain[:] = self.config.lag_s, 1.0
-        return self._observe()
+        return self.observe()
 
     def step(self, action: npt.ArrayLike) -> Step:
         """Advance all by dt under net accelerations k_ma clip(action, -1, 1), shape (N, 3)."""
@@ -213,7 +216,7 @@ class PointMassBatch:
         )
         terminated = reached | outside
         truncated = (self.steps >= c.max_steps) & ~terminated
-        return Step(self._observe(), terms.total, terminated, truncated, reached, terms)
+        return Step(self.observe(), terms.total, terminated, truncated, reached, terms)
 
     def _delayed(self, command: FloatArray) -> FloatArray:
         if not self.config.dead_steps:
@@ -223,9 +226,12 @@ class PointMassBatch:
         return due
 
     def _targets(self, p_enu: FloatArray) -> FloatArray:
-        """Uniform in the arena; for a share of the episodes pulled towards the start."""
+        """Uniform in the arena; for one share of the episodes at a wall, for another pulled towards the start."""
         c, shape = self.config, (len(p_enu), 1)
         target = self._rng.uniform(-c.arena_m, c.arena_m, p_enu.shape)
+        walled = np.flatnonzero(self._rng.uniform(size=len(p_enu)) < c.wall_share)
+        axis = self._rng.integers(0, 3, len(walled))
+        target[walled, axis] = np.sign(target[walled, axis]) * (c.arena_m - self._rng.uniform(0.0, 0.1, len(walled)))
         pull = np.where(self._rng.uniform(size=shape) < c.near_share, 10.0 ** self._rng.uniform(-1.5, 0.0, shape), 1.0)
         return np.asarray(p_enu + pull * (target - p_enu))
 
@@ -238,7 +244,7 @@ class PointMassBatch:
         room_m = np.maximum(c.arena_m - np.sign(v) * p_enu - c.lag_s * np.abs(v), 0.0)
         return np.asarray(np.sign(v) * np.minimum(np.abs(v), np.sqrt(1.6 * c.k_ma_m_s2 * room_m)))
 
-    def _observe(self) -> FloatArray:
+    def observe(self) -> FloatArray:
         """[v, e] with the configured noise, shape (N, 6)."""
         c = self.config
         observation = np.concatenate([self.v_enu, self.target_enu - self.p_enu], axis=1)

@@ -29,6 +29,7 @@ from companion.policy import (
     Manifest,
     VectorSpec,
 )
+from companion.torch_backend import FINE
 from policies.env import EnvConfig
 
 Arrays = Mapping[str, npt.NDArray[np.float32]]
@@ -36,64 +37,52 @@ OPSET, IR_VERSION = 17, 9  # readable by every ONNX Runtime since 1.14
 
 
 def axis_shared_onnx(weights: Arrays) -> bytes:
-    """`companion.torch_backend.axis_shared` with its clip as an ONNX model: observation (N, 6) -> action (N, 3)."""
+    """`companion.torch_backend.axis_shared` with its clip as an ONNX model: observation (N, 6) -> action (N, 3).
+
+    A node costs more than its arithmetic, so axes and signs are unrolled into few wide ones: one matrix scales and sums
+    (the normaliser), one is g's first layer for +x, +y, +z, -x, -y, -z, and the hidden layer works on six rows.
+    Inside it is float64, so that the order of additions leaves no trace in the float32 that comes out.
+    """
+    odd, even = weights["odd.weight"].astype(np.float64), weights["even.weight"].astype(np.float64)
+    per_axis = np.vstack([np.kron(np.eye(3), odd[:, k]) for k in range(3)])  # (9, 3 H): rows v, e, fine
+    unit = np.kron(np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 1.0, FINE]]), np.eye(3))  # v, e, v + e, FINE e
+    width = weights["hidden.bias"].shape[0]
     constants: dict[str, npt.NDArray[Any]] = {
-        "scale": weights["scale"],
-        "odd_w": weights["odd.weight"].T,
-        "even_w": weights["even.weight"].T,
-        "even_b": weights["even.bias"],
-        "hidden_w": weights["hidden.weight"].T,
-        "hidden_b": weights["hidden.bias"],
-        "out_w": weights["out.weight"].T,
-        "tiny": np.float32(1e-3),
-        "low": np.float32(-1.0),
-        "high": np.float32(1.0),
-        "one": np.array([1], dtype=np.int64),
-        "two": np.array([2], dtype=np.int64),
-        "halves": np.array([3, 3], dtype=np.int64),
+        "scale_w": unit / weights["scale"].astype(np.float64)[:, None],
+        "sum_w": np.kron(np.eye(3), np.ones((3, 1))),
+        "first_w": np.vstack([np.hstack([per_axis, -per_axis]), np.tile(even.T, 6)]),
+        "first_b": np.tile(weights["even.bias"].astype(np.float64), 6),
+        "hidden_w": weights["hidden.weight"].T.astype(np.float64),
+        "hidden_b": weights["hidden.bias"].astype(np.float64),
+        "out_w": np.kron(np.vstack([np.eye(3), -np.eye(3)]), weights["out.weight"].astype(np.float64).reshape(-1, 1)),
+        "low": np.array(-1.0),
+        "high": np.array(1.0),
+        "parts": np.array([6, 3, 3], dtype=np.int64),
+        "rows": np.array([-1, width], dtype=np.int64),
+        "whole": np.array([-1, 6 * width], dtype=np.int64),
     }
     node = helper.make_node
     nodes = [
-        node("Div", ["observation", "scale"], ["o"]),
-        node("Split", ["o", "halves"], ["v", "e"], axis=1),
-        node("Sign", ["e"], ["e_sign"]),
-        node("Abs", ["e"], ["e_abs"]),
-        node("Sqrt", ["e_abs"], ["e_sqrt"]),
-        node("Mul", ["e_sign", "e_sqrt"], ["e_root"]),
-        *[node("Unsqueeze", [name, "two"], [f"{name}_column"]) for name in ("v", "e", "e_root")],
-        node("Concat", ["v_column", "e_column", "e_root_column"], ["odd_in"], axis=2),
-        node("MatMul", ["odd_in", "odd_w"], ["odd"]),
-        node("ReduceL2", ["e"], ["distance"], axes=[1], keepdims=1),
-        node("ReduceL2", ["v"], ["speed"], axes=[1], keepdims=1),
-        node("Sqrt", ["distance"], ["distance_root"]),
-        node("Mul", ["v", "e"], ["ve"]),
-        node("ReduceSum", ["ve", "one"], ["dot"], keepdims=1),
-        node("Add", ["distance", "tiny"], ["distance_safe"]),
-        node("Div", ["dot", "distance_safe"], ["closing"]),
-        node("Concat", ["distance", "distance_root", "speed", "closing"], ["even_in"], axis=1),
-        node("MatMul", ["even_in", "even_w"], ["even_product"]),
-        node("Add", ["even_product", "even_b"], ["even_row"]),
-        node("Unsqueeze", ["even_row", "one"], ["even"]),
-        *_branch("plus", "Add"),
-        *_branch("minus", "Sub"),
-        node("Sub", ["plus_second", "minus_second"], ["difference"]),
-        node("MatMul", ["difference", "out_w"], ["column"]),
-        node("Squeeze", ["column", "two"], ["raw"]),
-        node("Clip", ["raw", "low", "high"], ["action"]),
+        node("Cast", ["observation"], ["wide"], to=TensorProto.DOUBLE),
+        node("MatMul", ["wide", "scale_w"], ["scaled"]),
+        node("Split", ["scaled", "parts"], ["v_e", "v_plus_e", "fine_e"], axis=1),
+        node("Softsign", ["fine_e"], ["fine"]),
+        node("Concat", ["v_e", "v_plus_e"], ["vectors"], axis=1),
+        node("Mul", ["vectors", "vectors"], ["squares"]),
+        node("MatMul", ["squares", "sum_w"], ["sums"]),
+        node("Sqrt", ["sums"], ["lengths"]),
+        node("Concat", ["v_e", "fine", "lengths"], ["features"], axis=1),
+        node("Gemm", ["features", "first_w", "first_b"], ["first_in"]),
+        node("Relu", ["first_in"], ["first"]),
+        node("Reshape", ["first", "rows"], ["first_rows"]),
+        node("Gemm", ["first_rows", "hidden_w", "hidden_b"], ["second_in"]),
+        node("Relu", ["second_in"], ["second_rows"]),
+        node("Reshape", ["second_rows", "whole"], ["second"]),
+        node("MatMul", ["second", "out_w"], ["raw"]),
+        node("Clip", ["raw", "low", "high"], ["clipped"]),
+        node("Cast", ["clipped"], ["action"], to=TensorProto.FLOAT),
     ]
     return _serialised(nodes, constants)
-
-
-def _branch(name: str, combine: str) -> list[onnx.NodeProto]:
-    """g(+-o_i, s) up to its last layer."""
-    node = helper.make_node
-    return [
-        node(combine, ["even", "odd"], [f"{name}_in"]),
-        node("Relu", [f"{name}_in"], [f"{name}_first"]),
-        node("MatMul", [f"{name}_first", "hidden_w"], [f"{name}_product"]),
-        node("Add", [f"{name}_product", "hidden_b"], [f"{name}_sum"]),
-        node("Relu", [f"{name}_sum"], [f"{name}_second"]),
-    ]
 
 
 def _serialised(nodes: list[onnx.NodeProto], constants: Mapping[str, npt.NDArray[Any]]) -> bytes:

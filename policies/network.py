@@ -12,12 +12,12 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from companion.torch_backend import axis_shared, invariants
+from companion.torch_backend import axis_shared, lengths
 
 V_SCALE_M_S, E_SCALE_M = 3.0, 5.0  # the normaliser: about the standard deviations met in training
 
 
-class AxisSharedNet(nn.Module):
+class AxisSharedNet(nn.Module):  # type: ignore[misc]  # mypy does not read torch
     """Parameters of both, in the shape that stable-baselines3 expects of an ``mlp_extractor``."""
 
     scale: torch.Tensor
@@ -27,11 +27,11 @@ class AxisSharedNet(nn.Module):
         self.latent_dim_pi, self.latent_dim_vf = 3, critic_width
         self.register_buffer("scale", torch.tensor([V_SCALE_M_S] * 3 + [E_SCALE_M] * 3))
         self.odd = nn.Linear(3, actor_width, bias=False)
-        self.even = nn.Linear(4, actor_width)
+        self.even = nn.Linear(3, actor_width)
         self.hidden = nn.Linear(actor_width, actor_width)
         self.out = nn.Linear(actor_width, 1, bias=False)
         self.critic = nn.Sequential(
-            nn.Linear(13, critic_width), nn.ReLU(), nn.Linear(critic_width, critic_width), nn.ReLU()
+            nn.Linear(12, critic_width), nn.ReLU(), nn.Linear(critic_width, critic_width), nn.ReLU()
         )
 
     def actor_weights(self) -> dict[str, torch.Tensor]:
@@ -49,7 +49,7 @@ class AxisSharedNet(nn.Module):
         v, e = scaled[:, :3], scaled[:, 3:]
         order, mirror = e.abs().argsort(dim=1), e.sign()
         v_class, e_class = torch.gather(v * mirror, 1, order), torch.gather(e.abs(), 1, order)
-        features = torch.cat([v_class, e_class, e_class.sqrt(), invariants(v, e)], dim=1)
+        features = torch.cat([v_class, e_class, e_class.sqrt(), lengths(v, e)], dim=1)
         latent: torch.Tensor = self.critic(features)
         return latent
 

@@ -15,7 +15,7 @@ from policies.env import EnvConfig, PointMassBatch
 ONE = np.ones(1, dtype=np.bool_)
 
 
-def _spaces() -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def _spaces() -> tuple[Any, Any]:
     return (
         gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float32),
         gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32),
@@ -87,7 +87,7 @@ class PointMassVecEnv(VecEnv):
         observation = out.observation.astype(np.float32)
         for i in np.flatnonzero(done):
             infos[i] = {
-                "terminal_observation": observation[i],
+                "terminal_observation": observation[i].copy(),  # its row is that of the next episode below
                 "TimeLimit.truncated": bool(out.truncated[i]),
                 "is_success": bool(out.reached[i]),
                 "episode": {"r": float(self._return[i]), "l": int(self.batch.steps[i])},
