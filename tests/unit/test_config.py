@@ -90,7 +90,7 @@ def test_profile_fills_what_the_file_leaves_out() -> None:
 def test_hash_sees_every_value_but_the_log() -> None:
     base = config_hash(parse_config({}))
     assert config_hash(parse_config({"log": {"directory": "/tmp/x"}})) == base
-    assert config_hash(parse_config({"safety": {"kappa": 2.5}})) != base
+    assert config_hash(parse_config({"safety": {"kappa": 3.0}})) != base
 
 
 def test_default_file_is_the_defaults() -> None:
