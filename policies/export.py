@@ -66,7 +66,9 @@ def axis_shared_onnx(weights: Arrays) -> bytes:
         node("Cast", ["observation"], ["wide"], to=TensorProto.DOUBLE),
         node("MatMul", ["wide", "scale_w"], ["scaled"]),
         node("Split", ["scaled", "parts"], ["v_e", "v_plus_e", "fine_e"], axis=1),
-        node("Softsign", ["fine_e"], ["fine"]),
+        node("Abs", ["fine_e"], ["fine_abs"]),  # Softsign has no float64 kernel
+        node("Add", ["fine_abs", "high"], ["fine_below"]),
+        node("Div", ["fine_e", "fine_below"], ["fine"]),
         node("Concat", ["v_e", "v_plus_e"], ["vectors"], axis=1),
         node("Mul", ["vectors", "vectors"], ["squares"]),
         node("MatMul", ["squares", "sum_w"], ["sums"]),
