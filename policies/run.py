@@ -94,6 +94,7 @@ def _progress(trained: Trained) -> dict[str, Any]:
     to_99 = trained.to_99
     return {
         "seconds": round(trained.seconds, 2),
+        "cpu_seconds": round(trained.cpu_seconds, 2),
         "steps_to_99_percent": None if to_99 is None else to_99.steps,
         "seconds_to_99_percent": None if to_99 is None else round(to_99.seconds, 2),
     }

@@ -74,6 +74,7 @@ class Trained:
     weights: dict[str, npt.NDArray[np.float32]]
     curve: tuple[CurvePoint, ...]
     seconds: float
+    cpu_seconds: float  # of this process: what the training costs where the machine is shared
 
     @property
     def to_99(self) -> CurvePoint | None:
@@ -191,7 +192,8 @@ def train(
     if resume is not None:
         restore_checkpoint(model, resume)
     recorder = CurveRecorder(env, max(1, config.steps // config.checkpoints), checkpoints, on_point)
-    start_s = time.perf_counter()
+    start_s, start_cpu_s = time.perf_counter(), time.process_time()
     if model.num_timesteps < config.steps:
         model.learn(config.steps - model.num_timesteps, callback=recorder, reset_num_timesteps=resume is None)
-    return Trained(actor_weights(model), tuple(recorder.points), time.perf_counter() - start_s)
+    seconds, cpu_seconds = time.perf_counter() - start_s, time.process_time() - start_cpu_s
+    return Trained(actor_weights(model), tuple(recorder.points), seconds, cpu_seconds)
