@@ -71,7 +71,7 @@ class Publisher:
         session: VehicleSession,
         *,
         target_enu: Vec3 | None,
-        counts: Mapping[str, int],
+        counts: Callable[[], Mapping[str, int]],
         meter: TickMeter,
     ) -> None:
         """The status, at 5 Hz and whenever the situation or the target changed."""
@@ -94,7 +94,7 @@ class Publisher:
             target=target,
             tracks=self._tracks,
             verdict=self._verdict,
-            counts=dict(counts),
+            counts=dict(counts()),
             tick_ms=meter.quantiles_ms(last=1000),
         )
         self._zenoh.put("companion/status", status)

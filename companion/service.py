@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,6 +134,8 @@ class Service:
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
             self._publisher = Publisher(zenoh, recorder)
+            gc.collect()
+            gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
@@ -283,7 +286,7 @@ class Service:
             self._vehicle_ns,
             self._session,
             target_enu=self._route.current,
-            counts=self._counts(),
+            counts=self._counts,
             meter=self._meter,
         )
 
