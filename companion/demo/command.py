@@ -100,6 +100,7 @@ def _report(free: FlightResult, flight: FlightResult) -> dict[str, Any]:
         "tick_ms": ticks,
         "deadline_misses": daemon["deadline_misses"],
         "real_time_factor": truth.get("real_time_factor") or truth["sim_s"] / truth["wall_s"],
+        "lockstep_ms": truth.get("tick_ms"),  # where a lockstep tick goes: sending, awaiting the daemon, physics
         "log": daemon["log"],
         "log_hash": daemon["log_hash"],
     }
@@ -151,6 +152,8 @@ def _print_table(report: dict[str, Any], flight: FlightResult, picture: Path) ->
     table.add_row("tick latency", f"p50 {tick['p50']:.2f} ms, p99 {tick['p99']:.2f} ms, max {tick['max']:.2f} ms")
     table.add_row("deadline misses", str(report["deadline_misses"]))
     table.add_row("real-time factor", f"{report['real_time_factor']:.1f}")
+    for part, cost in (report["lockstep_ms"] or {}).items():
+        table.add_row(f"lockstep: {part}", f"p50 {cost['p50']:.2f} ms, p99 {cost['p99']:.2f} ms")
     for approach in flight.simulator.get("approaches") or []:
         table.add_row(f"closest to {approach['id']}", f"{approach['clearance_m']:.2f} m at {approach['t_s']:.1f} s")
     console = Console()
