@@ -3,6 +3,9 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# what pip builds with is pinned by the same file; the name of the setting depends on pip's version
+export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
+export PIP_BUILD_CONSTRAINT := $(CURDIR)/constraints.txt
 
 # `python3.11` where it exists, else whatever python3 is (pyproject.toml refuses an older one)
 ifeq ($(shell command -v $(PYTHON) 2>/dev/null),)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import socket
 from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
+import zenoh
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.clock import SystemClock
@@ -63,10 +65,13 @@ class Autopilot:
     def _send(self, message: Any) -> None:
         self._socket.sendto(message.pack(self._mav), self._address)
 
+    def beat(self) -> None:
+        self._send(self._mav.heartbeat_encode(2, 12, 1 | 128, self.mode, 4))
+
     async def fly(self, ticks: int = 1) -> None:
         for _ in range(ticks):
             self.tick += 1
-            self._send(self._mav.heartbeat_encode(2, 12, 1 | 128, self.mode, 4))
+            self.beat()
             self._send(self._mav.extended_sys_state_encode(0, 2))
             self._send(self._mav.attitude_quaternion_encode(50 * self.tick, 1.0, 0, 0, 0, 0, 0, 0))
             self._send(self._mav.local_position_ned_encode(50 * self.tick, 0, 0, -2, 0, 0, 0))
@@ -170,6 +175,30 @@ def test_unknown_and_foreign_traffic_is_ignored() -> None:
         assert [(m.command, m.result) for m in autopilot.of("COMMAND_ACK")] == [(31_000, 3)]
 
     assert run(script).final_state == "READY"
+
+
+def test_the_vehicle_state_may_come_by_zenoh() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        config = zenoh.Config()
+        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        with zenoh.open(config) as session:
+            states = session.declare_publisher("uav/uav1/vehicle/state")
+            stamp_ms = 0
+            while not autopilot.of("SET_POSITION_TARGET_LOCAL_NED"):
+                stamp_ms += 50
+                state = {"stamp_ns": stamp_ms * 1_000_000, "frame": "local_ned"}
+                states.put(json.dumps({**state, "position": [1.0, 2.0, -3.0], "velocity": [0.0, 0.0, 0.0]}))
+                autopilot.beat()
+                await autopilot.listen()
+            states.put(b"{}")  # rejected, survived
+            await autopilot.listen()
+        setpoint = autopilot.of("SET_POSITION_TARGET_LOCAL_NED")[0]
+        assert 0 < setpoint.time_boot_ms <= stamp_ms
+
+    assert run(script, zenoh={"listen": [endpoint]}, vehicle={"source": "zenoh"}).ticks > 0
 
 
 def test_lockstep_names_the_source_that_is_missing() -> None:
