@@ -15,6 +15,7 @@ from companion.config import SafetyConfig
 from companion.types import FloatArray
 
 CLF_PERIOD_S = 0.05  # eta of (26) is applied once per this time
+_ONES = np.ones(3)
 _TINY = 1e-30  # stands for psi = 0: the row then asks for rise >= 0 alone
 
 
@@ -29,9 +30,13 @@ def epsilon_star(p_rel: FloatArray, v_rel: FloatArray, config: SafetyConfig) -> 
     Returns:
         (M,) in [0, 1 / alpha2].
     """
-    distance = np.maximum(np.sqrt(np.einsum("ij,ij->i", p_rel, p_rel)), 1e-6)
-    separation = np.maximum(np.einsum("ij,ij->i", p_rel, v_rel) / distance, 0.0)
-    return np.asarray(np.minimum(config.epsilon_max * separation / distance, 1.0 / config.alpha2))
+    separation = (p_rel * v_rel) @ _ONES  # times |p_rel|
+    np.maximum(separation, 0.0, out=separation)
+    if not separation.any():
+        return separation
+    separation *= config.epsilon_max
+    separation /= np.maximum((p_rel * p_rel) @ _ONES, 1e-12)
+    return np.minimum(separation, 1.0 / config.alpha2, out=separation)
 
 
 def clf_budget(previous: FloatArray, star: FloatArray, elapsed_s: FloatArray, eta: float) -> FloatArray:
@@ -53,8 +58,10 @@ def decay_interval(values: FloatArray, least: FloatArray) -> tuple[FloatArray, F
     """
     rise, psi = values
     opening = psi >= 0.0
-    bound = rise / np.where(opening, -_TINY - psi, _TINY - psi)
-    lower = np.maximum(np.where(opening, bound, 0.0).max(axis=-1), least)
-    upper = np.where(opening, 1.0, bound).min(axis=-1)
-    upper = np.minimum(upper, 1.0)
-    return lower, upper
+    bound = rise / (psi + np.copysign(_TINY, psi))  # less the decay at which the row is zero
+    if opening.all():
+        lower = np.maximum(0.0 - np.minimum.reduce(bound, axis=-1), least)
+        return lower, np.ones_like(lower)
+    lower = np.maximum(0.0 - np.minimum.reduce(np.where(opening, bound, 0.0), axis=-1), least)
+    upper = 0.0 - np.maximum.reduce(np.where(opening, -1.0, bound), axis=-1)
+    return lower, np.minimum(upper, 1.0, out=upper)

@@ -27,27 +27,29 @@ import numpy.typing as npt
 from companion.config import SafetyConfig
 from companion.types import FloatArray, Margin, Prediction, Vec3
 
-MIN_ARM_M = (
-    1e-3  # gradients are taken no shorter than that of a row with this arm: no division by zero at a ball's centre
-)
+MIN_ARM_M = 1e-3  # gradients are no shorter than that of a row with this arm: no division by zero at a ball's centre
+_HALVES = np.full(3, 0.5)
 
 
 def monomials(a: FloatArray) -> FloatArray:
-    """(1, a, |a|^2 / 2) along the last axis: (..., 3) -> (..., 5)."""
-    out = np.empty((*a.shape[:-1], 5))
-    out[..., 0] = 1.0
-    out[..., 1:4] = a
-    out[..., 4] = 0.5 * (a * a).sum(axis=-1)
+    """(1, a, |a|^2 / 2) of each of C accelerations, along the first axis: (C, 3) -> (5, C)."""
+    out = np.empty((5, len(a)))
+    out[0] = 1.0
+    out[1:4] = a.T
+    out[4] = (a * a) @ _HALVES
     return out
 
 
 @dataclass(frozen=True, slots=True)
 class BarrierRows:
-    """Rows of M obstacles, R = N + 1 each; coefficients over (1, a, |a|^2 / 2)."""
+    """Rows of M obstacles, R = N + 1 each; coefficients over (1, a, |a|^2 / 2).
+
+    Coefficients and components come first, so that one product of matrices evaluates all rows.
+    """
 
     ids: tuple[str, ...]
-    coefficients: FloatArray  # (2, M, R, 5), C-contiguous: of psi_{i+1} - psi_i and of psi_i [m^2]
-    drift: FloatArray  # (M, K, 3) c_k, vehicle minus obstacle without acceleration, ENU [m]
+    coefficients: FloatArray  # (5, 2, M, R), C-contiguous: of psi_{i+1} - psi_i and of psi_i [m^2]
+    drift: FloatArray  # (3, M, K) c_k, vehicle minus obstacle without acceleration, ENU [m]
     reach: FloatArray  # (K,) s_k [s^2]
     radii_m: FloatArray  # (M,) vehicle plus obstacle
     cushion_m: float
@@ -61,36 +63,39 @@ class BarrierRows:
 
     @property
     def rise(self) -> FloatArray:
-        """Coefficients of psi_{i+1} - psi_i, (M, R, 5) [m^2]."""
-        return np.asarray(self.coefficients[0])
+        """Coefficients of psi_{i+1} - psi_i, (5, M, R) [m^2]."""
+        return np.asarray(self.coefficients[:, 0])
 
     @property
     def psi(self) -> FloatArray:
-        """Coefficients of psi_i, (M, R, 5) [m^2]."""
-        return np.asarray(self.coefficients[1])
+        """Coefficients of psi_i, (5, M, R) [m^2]."""
+        return np.asarray(self.coefficients[:, 1])
 
     def evaluate(self, a: Vec3) -> FloatArray:
         """rise and psi at ``a`` (3,), stacked: (2, M, R) [m^2]."""
         x, y, z = a.tolist()
         basis = np.array((1.0, x, y, z, 0.5 * (x * x + y * y + z * z)))
-        return np.asarray((self.coefficients.reshape(-1, 5) @ basis).reshape(self.coefficients.shape[:3]))
+        return np.asarray((basis @ self.coefficients.reshape(5, -1)).reshape(self.coefficients.shape[1:]))
 
     def evaluate_many(self, a: FloatArray) -> FloatArray:
-        """rise and psi at ``a`` (C, 3), stacked: (2, C, M, R) [m^2]."""
-        count, rows = self.coefficients.shape[1:3]
-        flat = self.coefficients.reshape(2, count * rows, 5).swapaxes(1, 2)
-        return np.asarray((monomials(a) @ flat).reshape(2, len(a), count, rows))
+        """rise and psi at ``a`` (C, 3), stacked: (2, C, M, R) [m^2], C contiguous: reductions over rows are cheap."""
+        values = self.coefficients.reshape(5, -1).T @ monomials(a)
+        return np.asarray(values.reshape(*self.coefficients.shape[1:], len(a)).transpose(0, 3, 1, 2))
 
     def gradient(self, a: Vec3, decay: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """d g / d a at ``a`` with the obstacles' ``decay`` (M,): (M, R, 3) [m s^2], and its norm, floored (M, R)."""
-        combined = self.rise + decay[:, None, None] * self.psi
-        gradient = combined[..., 1:4] + combined[..., 4:5] * a
-        norm = np.sqrt(np.einsum("ijk,ijk->ij", gradient, gradient))
-        return gradient, np.maximum(norm, MIN_ARM_M * self.reach[2:])
+        """d g / d a at ``a`` with the obstacles' ``decay`` (M,): (3, M, R) [m s^2], and its norm, floored (M, R)."""
+        combined = self.coefficients[1:, 1] * decay[:, None]
+        combined += self.coefficients[1:, 0]
+        gradient = combined[3] * a[:, None, None]
+        gradient += combined[:3]
+        norm = np.sqrt(np.add.reduce(gradient * gradient))
+        return gradient, np.maximum(norm, MIN_ARM_M * self.reach[2:], out=norm)
 
     def positions(self, a: FloatArray) -> FloatArray:
-        """r_k, vehicle minus obstacle, from k = 2 (the first that ``a`` moves): (..., 3) -> (..., M, R, 3) [m]."""
-        return self.drift[:, 2:] + self.reach[2:, None] * a[..., None, None, :]
+        """r_k, vehicle minus obstacle, from k = 2 (the first that ``a`` moves): (..., 3) -> (3, ..., M, R) [m]."""
+        a = a.T if a.ndim > 1 else a  # (3, C) or (3,)
+        drift = self.drift[:, :, 2:] if a.ndim == 1 else self.drift[:, None, :, 2:]
+        return np.asarray(drift + a[..., None, None] * self.reach[2:])
 
     def margins(self, steps: npt.NDArray[np.intp]) -> list[Margin]:
         """The parts of D of one row of each obstacle, ``steps`` (M,)."""
@@ -100,17 +105,18 @@ class BarrierRows:
 
     def select(self, obstacles: npt.NDArray[np.bool_]) -> BarrierRows:
         """The rows of some obstacles only; ``obstacles`` is a boolean mask (M,)."""
+        taken = obstacles.nonzero()[0]
         return BarrierRows(
-            ids=tuple(name for name, taken in zip(self.ids, obstacles, strict=True) if taken),
-            coefficients=np.ascontiguousarray(self.coefficients[:, obstacles]),
-            drift=self.drift[obstacles],
+            ids=tuple([self.ids[index] for index in taken.tolist()]),
+            coefficients=self.coefficients.take(taken, axis=2),
+            drift=self.drift.take(taken, axis=1),
             reach=self.reach,
-            radii_m=self.radii_m[obstacles],
+            radii_m=self.radii_m.take(taken),
             cushion_m=self.cushion_m,
-            sigma_m=self.sigma_m[obstacles],
-            delay_m=self.delay_m[obstacles],
-            least_decay=self.least_decay[obstacles],
-            keep_out_m=self.keep_out_m[obstacles],
+            sigma_m=self.sigma_m.take(taken, axis=0),
+            delay_m=self.delay_m.take(taken),
+            least_decay=self.least_decay.take(taken),
+            keep_out_m=self.keep_out_m.take(taken, axis=0),
         )
 
 
@@ -122,8 +128,14 @@ class Barrier:
         steps = np.arange(config.horizon + 3)
         self._time_s = steps * config.dt_s
         self._reach: FloatArray = np.asarray(config.dt_s**2 * steps * (steps - 1) / 2.0, dtype=np.float64)
-        self._reach_square = self._reach**2
-        self._sigma_at = np.minimum(steps[2:], round(config.sigma_growth_s / config.dt_s))
+        square = self._reach**2
+        decayed = square[1:] - (1.0 - config.alpha1) * square[:-1]
+        self._curvature = np.stack((decayed[1:] - decayed[:-1], decayed[:-1]))[:, None]  # (2, 1, R) of |a|^2 / 2
+        # the sigma of instants 2, 3, ... counts up to the growth's end; every later row has that of the last
+        self._sigma_to = min(max(round(config.sigma_growth_s / config.dt_s), 0), config.horizon + 2)
+        sigma_at = np.minimum(steps[2:], self._sigma_to)
+        self._sigma_from = int(sigma_at[0])
+        self._sigma_at = sigma_at - self._sigma_from
         self._letter = math.sqrt(2.0) if config.form == "paper" else 1.0
 
     def rows(self, p_enu: Vec3, v_enu: Vec3, prediction: Prediction, p_std_m: float) -> BarrierRows:
@@ -140,23 +152,17 @@ class Barrier:
         instants = config.horizon + 3
         if prediction.p_enu.shape[1] < instants:
             raise ValueError(f"prediction: expected {instants} instants (horizon + 3), got {prediction.p_enu.shape[1]}")
-        drift = (p_enu + self._time_s[:, None] * v_enu) - prediction.p_enu[:, :instants]
-        half_square = np.empty((*drift.shape[:2], 5))  # |r_k|^2 / 2 over the monomials
-        half_square[..., 0] = 0.5 * np.einsum("ijk,ijk->ij", drift, drift)
-        half_square[..., 1:4] = self._reach[:, None] * drift
-        half_square[..., 4] = self._reach_square
-        decayed = half_square[:, 1:] - (1.0 - config.alpha1) * half_square[:, :-1]  # psi without its D
-        sigma = config.kappa * np.sqrt(prediction.sigma_m[:, self._sigma_at] ** 2 + p_std_m**2)
-        sigma = np.minimum(sigma, config.sigma_cap_m)
+        sigma = self._sigma(prediction, p_std_m)
         relative = prediction.v_enu - v_enu
-        delay = config.sigma_delay_s * np.sqrt((relative * relative).sum(axis=-1))
+        delay = config.sigma_delay_s * np.sqrt(2.0 * ((relative * relative) @ _HALVES))
         radii = prediction.radius_m + config.drone_radius_m
-        keep_out = self._letter * ((radii + delay + config.cushion_m)[:, None] + sigma)
-        coefficients = np.empty((2, len(drift), instants - 2, 5))
-        np.subtract(decayed[:, 1:], decayed[:, :-1], out=coefficients[0])
-        psi = coefficients[1]
-        psi[...] = decayed[:, :-1]
-        psi[..., 0] -= (0.5 * config.alpha1) * keep_out**2
+        keep_out = sigma + (radii + delay + config.cushion_m)[:, None]
+        if self._letter != 1.0:
+            keep_out *= self._letter
+        path = p_enu[:, None] + v_enu[:, None] * self._time_s
+        drift = np.empty((3, len(prediction), instants))
+        np.subtract(path[:, None], prediction.p_enu[:, :instants].transpose(2, 0, 1), out=drift)
+        coefficients = self._coefficients(drift, keep_out)
         return BarrierRows(
             ids=prediction.ids,
             coefficients=coefficients,
@@ -166,6 +172,29 @@ class Barrier:
             cushion_m=config.cushion_m,
             sigma_m=sigma,
             delay_m=delay,
-            least_decay=np.where(psi[:, 0, 0] < 0.0, config.recovery, 0.0),
+            least_decay=config.recovery * (coefficients[0, 1, :, 0] < 0.0),
             keep_out_m=keep_out,
         )
+
+    def _sigma(self, prediction: Prediction, p_std_m: float) -> FloatArray:
+        """kappa sigma of every row, (M, R) [m]: computed where it differs, then spread over the rows."""
+        sigma = prediction.sigma_m[:, self._sigma_from : self._sigma_to + 1]
+        sigma = np.sqrt(sigma * sigma + p_std_m * p_std_m)
+        sigma *= self._config.kappa
+        np.minimum(sigma, self._config.sigma_cap_m, out=sigma)
+        return np.asarray(sigma.take(self._sigma_at, axis=1))
+
+    def _coefficients(self, drift: FloatArray, keep_out: FloatArray) -> FloatArray:
+        """(5, 2, M, R) from c_k (3, M, K): |r_k|^2 / 2 over the monomials, decayed to psi, stepped to rise."""
+        _, count, instants = drift.shape
+        half_square = np.empty((4, count, instants))
+        np.multiply(drift, self._reach, out=half_square[1:])
+        np.matmul(_HALVES, (drift * drift).reshape(3, -1), out=half_square[0].reshape(-1))
+        decayed = half_square[..., :-1] * (self._config.alpha1 - 1.0)
+        decayed += half_square[..., 1:]  # psi without its D
+        coefficients = np.empty((5, 2, count, instants - 2))
+        np.subtract(decayed[..., 1:], decayed[..., :-1], out=coefficients[:4, 0])
+        coefficients[:4, 1] = decayed[..., :-1]
+        coefficients[0, 1] -= (0.5 * self._config.alpha1) * (keep_out * keep_out)
+        coefficients[4] = self._curvature
+        return coefficients

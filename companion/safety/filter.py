@@ -20,14 +20,14 @@ the bound (`limits`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
 from companion.safety.adapt import clf_budget, decay_interval, epsilon_star
-from companion.safety.barrier import Barrier, BarrierRows
+from companion.safety.barrier import Barrier
 from companion.safety.limits import vehicle_limits
 from companion.safety.relax import braking
 from companion.safety.search import solve_task
@@ -74,14 +74,17 @@ class SafetyFilter:
             ValueError: the prediction is shorter than horizon + 3 instants.
         """
         task = self._task(inputs)
-        lower, upper = decay_interval(task.rows.evaluate(inputs.a_ref), task.rows.least_decay)
+        values = task.rows.evaluate(inputs.a_ref)
+        lower, upper = decay_interval(values, task.rows.least_decay)
         if bool((lower <= upper).all()) and task.limits.admits(inputs.a_ref):
             found = Found(inputs.a_ref, lower / self._safety.alpha2, True, 0.0, 0, "none")
-            return self._answer(task, found, Verdict.NOMINAL)
-        found, fallback = self._solve(task)
-        return self._answer(task, found, Verdict.BRAKING if fallback else Verdict.ADJUSTED)
+            return self._answer(task, found, values, Verdict.NOMINAL)
+        task = replace(task, budget=self._budget(task, inputs.elapsed_s or 0.0))
+        found, values, fallback = self._solve(task)
+        return self._answer(task, found, values, Verdict.BRAKING if fallback else Verdict.ADJUSTED)
 
     def _task(self, inputs: FilterInput) -> Task:
+        """The problem, its CLF without a budget as yet: a reference that passes needs none."""
         config, prediction = self._safety, inputs.prediction
         rows = self._barrier.rows(inputs.p_enu, inputs.v_enu, prediction, inputs.p_std_m)
         limits = vehicle_limits(
@@ -92,15 +95,18 @@ class SafetyFilter:
             shrink_m_s2=inputs.accel_shrink_m_s2,
             dt_s=config.dt_s,
         )
-        star = epsilon_star(-rows.drift[:, 0], prediction.v_enu - inputs.v_enu, config)
-        elapsed_s = inputs.elapsed_s or 0.0
-        known = np.array([name in self._epsilon for name in rows.ids], dtype=np.bool_)
-        previous = np.array([self._epsilon.get(name, 1.0 / config.alpha2) for name in rows.ids])
-        budget = clf_budget(previous, star, np.where(known, elapsed_s, 0.0), config.eta)
-        return Task(rows, limits, inputs.a_ref, star, budget, config)
+        star = epsilon_star(-rows.drift[:, :, 0].T, prediction.v_enu - inputs.v_enu, config)
+        return Task(rows, limits, inputs.a_ref, star, star, config)
 
-    def _solve(self, task: Task) -> tuple[Found, bool]:
-        """The answer with epsilons of all obstacles, and whether it had to do without solvers."""
+    def _budget(self, task: Task, elapsed_s: float) -> FloatArray:
+        """What the CLF leaves each obstacle; one without history starts from the greatest epsilon."""
+        ids, config = task.rows.ids, self._safety
+        previous = np.array([self._epsilon.get(name, 1.0 / config.alpha2) for name in ids])
+        elapsed = np.array([elapsed_s if name in self._epsilon else 0.0 for name in ids])
+        return clf_budget(previous, task.star, elapsed, config.eta)
+
+    def _solve(self, task: Task) -> tuple[Found, FloatArray, bool]:
+        """The answer with epsilons of all obstacles, the rows there, and whether it had to do without solvers."""
         near = within_reach(task.rows, task.limits)
         rows = task.rows if near.all() else task.rows.select(near)
         a_ref = turned(rows, task.a_ref)
@@ -109,15 +115,18 @@ class SafetyFilter:
             found, fallback = solve_task(reduced, self._last, self._order), False
         except SolverError:
             found, fallback = braking(reduced, self._last), True
-        lower, upper = decay_interval(task.rows.evaluate(found.a), task.rows.least_decay)
+        values = task.rows.evaluate(found.a)
+        if rows is task.rows:
+            return found, values, fallback
+        lower, upper = decay_interval(values, task.rows.least_decay)
         epsilon = np.minimum(np.maximum(task.star, lower / self._safety.alpha2), upper / self._safety.alpha2)
         epsilon[near] = found.epsilon
-        return Found(found.a, epsilon, found.admissible, found.cost, found.iterations, found.solver), fallback
+        return replace(found, epsilon=epsilon), values, fallback
 
-    def _answer(self, task: Task, found: Found, verdict: Verdict) -> FilterResult:
+    def _answer(self, task: Task, found: Found, values: FloatArray, verdict: Verdict) -> FilterResult:
         """The record: the true rows at the answer decide between adjusted and relaxed."""
         a, rows = found.a, task.rows
-        obstacles = _worst_rows(rows, a, found.epsilon, task.star, self._safety.alpha2)
+        obstacles = _worst_rows(task, found, values)
         slacks = task.limits.slacks(a)
         limits = [
             RowRecord(track=name, step=-1, slack=slack, margin=None, epsilon=0.0, epsilon_star=0.0)
@@ -133,22 +142,18 @@ class SafetyFilter:
         return FilterResult(a, verdict, worst, records, found.iterations, found.solver)
 
 
-def _worst_rows(rows: BarrierRows, a: Vec3, epsilon: FloatArray, star: FloatArray, alpha2: float) -> list[RowRecord]:
-    """The row of least slack of each obstacle, in m/s^2: the row's value over its gradient's norm at ``a``."""
+def _worst_rows(task: Task, found: Found, values: FloatArray) -> list[RowRecord]:
+    """The row of least slack of each obstacle, in m/s^2: the row's value over its gradient's norm at the answer."""
+    rows, (rise, psi) = task.rows, values
     if not len(rows):
         return []
-    decay = alpha2 * epsilon
-    rise, psi = rows.evaluate(a)
-    _, norm = rows.gradient(a, decay)
-    slack = (rise + decay[:, None] * psi) / norm
-    steps, own = slack.argmin(axis=-1), np.arange(len(rows))
-    parts = zip(
-        rows.ids,
-        steps.tolist(),
-        slack[own, steps].tolist(),
-        rows.margins(steps),
-        epsilon.tolist(),
-        star.tolist(),
-        strict=True,
-    )
+    decay = task.config.alpha2 * found.epsilon
+    _, norm = rows.gradient(found.a, decay)
+    slack = psi * decay[:, None]
+    slack += rise
+    slack /= norm
+    steps = slack.argmin(axis=-1)
+    least = np.minimum.reduce(slack, axis=-1)
+    names, epsilons, stars = rows.ids, found.epsilon.tolist(), task.star.tolist()
+    parts = zip(names, steps.tolist(), least.tolist(), rows.margins(steps), epsilons, stars, strict=True)
     return [RowRecord(*part) for part in parts]

@@ -9,6 +9,7 @@ asked; a program that a solver proves infeasible is not asked again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -38,8 +39,8 @@ class Program:
 
     def residual(self, x: FloatArray) -> float:
         """Greatest violation of a row or bound at ``x``, 0 where all hold."""
-        worst = max(float((self.low - x).max()), float((x - self.high).max()), 0.0)
-        return max(worst, float((self.floor - self.rows @ x).max())) if len(self.floor) else worst
+        broken = np.concatenate((self.low - x, x - self.high, self.floor - self.rows @ x))
+        return max(float(np.maximum.reduce(broken)), 0.0)
 
 
 class Infeasible(SolverError):
@@ -55,11 +56,14 @@ def solve_daqp(program: Program) -> FloatArray | None:
     Raises:
         Infeasible: proven by the dual's growth.
     """
-    count = len(program.linear) + len(program.floor)
-    upper = np.full(count, UNBOUNDED)
-    upper[: len(program.high)] = program.high
+    size = len(program.linear)
+    count = size + len(program.floor)
+    hessian = np.zeros((size, size))
+    hessian.reshape(-1)[:: size + 1] = program.weight
+    upper = np.empty(count)
+    upper[:size], upper[size:] = program.high, UNBOUNDED
     x, _, flag, _ = daqp.solve(
-        np.diag(program.weight),
+        hessian,
         program.linear,
         program.rows,
         upper,
@@ -110,6 +114,6 @@ def solve(program: Program, order: tuple[str, ...]) -> tuple[FloatArray, str]:
     """
     for name in order:
         x = BACKENDS[name](program)
-        if x is not None and bool(np.isfinite(x).all()) and program.residual(x) <= RESIDUAL:
+        if x is not None and math.isfinite(x @ x) and program.residual(x) <= RESIDUAL:
             return x, name
     raise SolverError(f"no answer from {', '.join(order)}: {len(program.linear)} variables, {len(program.floor)} rows")

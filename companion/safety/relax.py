@@ -29,9 +29,10 @@ SETTLED_M_S2 = 1e-3  # iterates closer than this have converged
 def shares(rows: BarrierRows, a: FloatArray) -> FloatArray:
     """Least share of the margin left by any obstacle over the horizon at ``a`` (C, 3): 1 all, 0 contact, (C,)."""
     r = rows.positions(a)
-    distance = np.sqrt(np.einsum("...k,...k->...", r, r))
-    share = (distance - rows.radii_m[:, None]) / _margins(rows)
-    return np.asarray(share.min(axis=(-2, -1), initial=1.0))
+    share = np.sqrt(np.add.reduce(r * r))  # (C, M, R)
+    share -= rows.radii_m[:, None]
+    share /= _margins(rows)
+    return np.asarray(np.minimum.reduce(share.reshape(len(a), share[0].size), axis=-1, initial=1.0))
 
 
 def _margins(rows: BarrierRows) -> FloatArray:
@@ -70,14 +71,13 @@ def _share_program(task: Task, a: Vec3, low: Vec3, high: Vec3) -> Program:
     """Variables a, t, t at the horizon's end, the speed limit's slack: |r_k|'s tangent at ``a`` >= R + t (D - R)."""
     rows = task.rows
     r = rows.positions(a)
-    distance = np.maximum(np.sqrt(np.einsum("ijk,ijk->ij", r, r)), 1e-9)
-    reach = rows.reach[2:]
-    normal = r * (reach[:, None] / distance[..., None])
-    floor = (normal @ a) - distance + rows.radii_m[:, None]
+    distance = np.maximum(np.sqrt(np.add.reduce(r * r)), 1e-9)
+    normal = r * (rows.reach[2:] / distance)
+    floor = (a @ normal.reshape(3, -1)).reshape(distance.shape) - distance + rows.radii_m[:, None]
     margins, every = _margins(rows), floor.size
     tangents = np.zeros((every + len(rows) + 1, 6))
     floors = np.empty(len(tangents))
-    tangents[:every, :3], tangents[every:-1, :3] = normal.reshape(-1, 3), normal[:, -1]
+    tangents[:every, :3], tangents[every:-1, :3] = normal.reshape(3, -1).T, normal[:, :, -1].T
     tangents[:every, 3], tangents[every:-1, 4] = -margins.reshape(-1), -margins[:, -1]
     floors[:every], floors[every:-1] = floor.reshape(-1), floor[:, -1]
     tangents[-1, :3], floors[-1] = task.limits.speed_row(a)

@@ -9,8 +9,10 @@ one is the next iterate. The sequence is cut after a fixed number of programs; a
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from companion.errors import SolverError
 from companion.safety.qp import UNBOUNDED, Infeasible, Program, solve
@@ -24,7 +26,7 @@ INSET_M_S2 = 1e-7  # tangents are kept by this much, so that the solver's tolera
 _STEPS = np.array([[1.0], [0.5], [0.25], [0.1]])  # shares of a program's step that are judged
 
 
-def least_cost(task: Task, start: Found, order: tuple[str, ...]) -> Found:
+def least_cost(task: Task, shared: Form, start: Found, order: tuple[str, ...]) -> Found:
     """The best admissible iterate of a sequence of programs from ``start``; ``start`` itself if none is better.
 
     Raises:
@@ -34,7 +36,7 @@ def least_cost(task: Task, start: Found, order: tuple[str, ...]) -> Found:
     best, a, epsilon = start, start.a, start.epsilon
     for count in range(1, task.config.iterations + 1):
         try:
-            x, solver = solve(_tangent_program(task, a, epsilon), order)
+            x, solver = solve(_tangent_program(task, shared, a, epsilon), order)
         except SolverError as error:
             if start.admissible and not best.iterations and not isinstance(error, Infeasible):
                 raise
@@ -54,43 +56,57 @@ def least_cost(task: Task, start: Found, order: tuple[str, ...]) -> Found:
     return best
 
 
-def _tangent_program(task: Task, a: Vec3, epsilon: FloatArray) -> Program:
-    """(29) about (a, epsilon): variables a, epsilon_j, delta_j; rows that cannot bind in the box are left out."""
-    config, limits, count = task.config, task.limits, len(task.rows)
-    top = 1.0 / config.alpha2
-    rise, psi = task.rows.evaluate(a)
-    decay = config.alpha2 * epsilon
-    gradient, norm = task.rows.gradient(a, decay)
-    slope = config.alpha2 * psi / norm  # d row / d epsilon
-    normal = gradient / norm[..., None]
-    floor = normal @ a - rise / norm + INSET_M_S2  # the terms in epsilon cancel: the row is affine in it
-    middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
-    least = normal @ middle - np.abs(normal) @ half + top * np.minimum(slope, 0.0)
-    which, step = (least < floor).nonzero()
-    kept, own = len(which), np.arange(count)
-    rows = np.zeros((kept + count + 1, 3 + 2 * count))
-    floors = np.empty(len(rows))
-    rows[:kept, :3] = normal[which, step]
-    rows[np.arange(kept), 3 + which] = slope[which, step]
-    floors[:kept] = floor[which, step]
-    tangent = 2.0 * (epsilon - task.star)  # of (26): delta - tangent epsilon >= V - budget - tangent epsilon_0
-    rows[kept + own, 3 + own] = -tangent
-    rows[kept + own, 3 + count + own] = 1.0
-    floors[kept:-1] = (epsilon - task.star) ** 2 - task.budget - tangent * epsilon
-    rows[-1, :3], floors[-1] = limits.speed_row(a)
-    return _priced(task, rows, floors)
+@dataclass(frozen=True, slots=True)
+class Form:
+    """What the programs of one task share."""
+
+    weight: FloatArray
+    linear: FloatArray
+    low: FloatArray
+    high: FloatArray
+    empty: FloatArray  # (R M + M + 1, 3 + 2 M) rows: ones at the deltas, nothing else
+    slopes: npt.NDArray[np.intp]  # (R M,) where, in the flat rows, a barrier row has its slope in epsilon
+    clf: npt.NDArray[np.intp]  # (M,) where the CLF row of an obstacle has its own
 
 
-def _priced(task: Task, rows: FloatArray, floors: FloatArray) -> Program:
-    """The program of (29)'s cost and bounds with the given rows."""
+def form(task: Task) -> Form:
+    """(29)'s cost and bounds over a, epsilon_j, delta_j, and the places of the rows' entries."""
     config, limits, count = task.config, task.limits, len(task.rows)
-    epsilons, deltas = slice(3, 3 + count), slice(3 + count, None)
-    weight, linear, low, high = np.zeros((4, 3 + 2 * count))
+    epsilons, deltas, size = slice(3, 3 + count), slice(3 + count, None), 3 + 2 * count
+    weight, linear, low, high = np.zeros((4, size))
     weight[:3], weight[epsilons], weight[deltas] = config.lambda_u, config.lambda_epsilon, config.lambda_delta
     linear[:3], linear[epsilons] = config.lambda_u * task.a_ref, config.lambda_epsilon * task.star
     low[:3], low[epsilons] = limits.low, task.rows.least_decay / config.alpha2
     high[:3], high[epsilons], high[deltas] = limits.high, 1.0 / config.alpha2, UNBOUNDED
-    return Program(2.0 * weight, -2.0 * linear, low, high, rows, floors)
+    every = count * (config.horizon + 1)
+    empty = np.zeros((every + count + 1, size))
+    own, row = np.arange(count), np.arange(every)
+    empty[every + own, 3 + count + own] = 1.0
+    slopes = row * size + 3 + row // (config.horizon + 1)
+    return Form(2.0 * weight, -2.0 * linear, low, high, empty, slopes, (every + own) * size + 3 + own)
+
+
+def _tangent_program(task: Task, shared: Form, a: Vec3, epsilon: FloatArray) -> Program:
+    """(29) about (a, epsilon): variables a, epsilon_j, delta_j."""
+    config, count = task.config, len(task.rows)
+    rise, psi = task.rows.evaluate(a)
+    normal, norm = task.rows.gradient(a, config.alpha2 * epsilon)
+    normal /= norm
+    normal = normal.reshape(3, -1)
+    every = normal.shape[1]
+    rows, floors = shared.empty.copy(), np.empty(len(shared.empty))
+    rows[:every, :3] = normal.T
+    psi *= config.alpha2
+    psi /= norm  # d row / d epsilon
+    rows.reshape(-1)[shared.slopes] = psi.reshape(-1)
+    rise /= norm
+    np.subtract(a @ normal + INSET_M_S2, rise.reshape(-1), out=floors[:every])  # no epsilon: the row is affine in it
+    deviation = epsilon - task.star
+    tangent = 2.0 * deviation  # of (26): delta - tangent epsilon >= V - budget - tangent epsilon_0
+    rows.reshape(-1)[shared.clf] = -tangent
+    floors[every:-1] = deviation * deviation - task.budget - tangent * epsilon
+    rows[-1, :3], floors[-1] = task.limits.speed_row(a)
+    return Program(shared.weight, shared.linear, shared.low, shared.high, rows, floors)
 
 
 def solve_task(task: Task, last: Vec3 | None, order: tuple[str, ...]) -> Found:
@@ -102,13 +118,13 @@ def solve_task(task: Task, last: Vec3 | None, order: tuple[str, ...]) -> Found:
     Raises:
         SolverError: no solver works; `braking` needs none.
     """
-    starts = candidates(task, last)
+    starts, shared = candidates(task, last), form(task)
     judgement = judge(task, starts)
     ranked = np.where(judgement.admissible, judgement.cost, np.inf)
-    found = least_cost(task, _start(task, starts, judgement, 0), order)
+    found = least_cost(task, shared, _start(task, starts, judgement, 0), order)
     first = int(ranked.argmin())
     if ranked[first] < found.cost:
-        other = least_cost(task, _start(task, starts, judgement, first), order)
+        other = least_cost(task, shared, _start(task, starts, judgement, first), order)
         found = other if other.cost < found.cost else found
     return found if found.admissible else least_violation(task, starts, order)
 

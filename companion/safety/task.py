@@ -71,23 +71,29 @@ def within_reach(rows: BarrierRows, limits: VehicleLimits) -> npt.NDArray[np.boo
 
     At decay 1 a row is psi_{i+1} >= 0; over |a| <= sqrt(3) box it is at least its constant less |linear| |a|.
     """
-    at_one = rows.rise + rows.psi
-    linear = np.sqrt(np.einsum("ijk,ijk->ij", at_one[..., 1:4], at_one[..., 1:4]))
-    least = at_one[..., 0] - (3.0**0.5 * limits.box_m_s2) * linear
-    return np.asarray((least < 0.0).any(axis=-1))
+    at_one = rows.rise[:4] + rows.psi[:4]
+    linear = np.sqrt(np.add.reduce(at_one[1:] * at_one[1:]))
+    return np.asarray(np.logical_or.reduce(at_one[0] < (math.sqrt(3.0) * limits.box_m_s2) * linear, axis=-1))
 
 
 def judge(task: Task, a: FloatArray) -> Judgement:
-    """True rows and limits at ``a`` (C, 3), all in one batch."""
+    """True rows and limits at ``a`` (C, 3), within the box, all in one batch."""
     config = task.config
     lower, upper = decay_interval(task.rows.evaluate_many(a), task.rows.least_decay)
-    lower, upper = lower / config.alpha2, upper / config.alpha2
-    admissible = (lower <= upper).all(axis=-1) & (task.limits.slow(a) <= config.tolerance_m_s2)
-    epsilon = np.minimum(np.maximum(task.star, lower), upper)
-    deviation = (epsilon - task.star) ** 2
+    lower /= config.alpha2
+    upper /= config.alpha2
+    admissible = np.logical_and.reduce(lower <= upper, axis=-1)
+    if task.limits.may_speed():
+        admissible &= task.limits.slow(a) <= config.tolerance_m_s2
+    deviation = np.minimum(np.maximum(task.star, lower), upper)
+    deviation -= task.star
+    deviation *= deviation
     delta = np.maximum(deviation - task.budget, 0.0)
-    priced = config.lambda_epsilon * deviation + config.lambda_delta * delta * delta
-    cost = config.lambda_u * ((a - task.a_ref) ** 2).sum(axis=-1) + priced.sum(axis=-1)
+    delta *= delta
+    away = a - task.a_ref
+    cost = (away * away) @ np.full(3, config.lambda_u)
+    cost += deviation @ np.full(len(task.rows), config.lambda_epsilon)
+    cost += delta @ np.full(len(task.rows), config.lambda_delta)
     return Judgement(lower, upper, admissible, cost)
 
 
@@ -98,8 +104,8 @@ def candidates(task: Task, last: Vec3 | None) -> FloatArray:
     if last is not None:
         starts.insert(0, last[None])
     if len(task.rows):
-        ring = _ring(task.rows)
-        starts += [box * ring, 0.5 * box * ring]
+        ring = box * _ring(task.rows)
+        starts += [ring, 0.5 * ring]
     return task.limits.clip(np.concatenate(starts))
 
 
@@ -111,15 +117,19 @@ def turned(rows: BarrierRows, a_ref: Vec3) -> Vec3:
     strength = math.hypot(*a_ref.tolist())
     if not len(rows) or strength < 1e-3:
         return a_ref
-    r, v = rows.drift[:, 0], (rows.drift[:, 1] - rows.drift[:, 0]) / math.sqrt(rows.reach[2])
-    distance = np.sqrt(np.einsum("ij,ij->i", r, r))
-    standing = (distance - rows.keep_out_m[:, 0] < STANDING_M) & (np.einsum("ij,ij->i", v, v) < STANDING_M_S**2)
-    standing &= r @ a_ref < -STANDING_COS * strength * distance
+    r = rows.drift[:, :, 0]
+    distance = np.sqrt(np.add.reduce(r * r))
+    standing = distance - rows.keep_out_m[:, 0] < STANDING_M
+    if not standing.any():
+        return a_ref
+    v = (rows.drift[:, :, 1] - r) / math.sqrt(rows.reach[2])
+    standing &= np.add.reduce(v * v) < STANDING_M_S**2
+    standing &= a_ref @ r < -STANDING_COS * strength * distance
     if not standing.any():
         return a_ref
     nearest = int(np.where(standing, distance, np.inf).argmin())
-    towards = -r[nearest] / distance[nearest]
-    side = v[nearest] - (v[nearest] @ towards) * towards
+    towards = -r[:, nearest] / distance[nearest]
+    side = v[:, nearest] - (v[:, nearest] @ towards) * towards
     speed = math.hypot(*side.tolist())
     if speed < 0.02:
         side = np.array((towards[1], -towards[0], 0.0)) if abs(towards[2]) < 0.99 else np.array((1.0, 0.0, 0.0))
@@ -129,11 +139,11 @@ def turned(rows: BarrierRows, a_ref: Vec3) -> Vec3:
 
 def _ring(rows: BarrierRows) -> FloatArray:
     """Unit vectors across the relative velocity of the obstacle that comes closest, the first to the right, (P, 3)."""
-    distance = np.einsum("ijk,ijk->ij", rows.drift, rows.drift).min(axis=-1)
-    nearest = rows.drift[int((np.sqrt(distance) - rows.radii_m).argmin())]
-    x, y, z = (nearest[1] - nearest[0]).tolist()
+    distance = np.minimum.reduce(np.add.reduce(rows.drift * rows.drift), axis=-1)
+    nearest = rows.drift[:, int((np.sqrt(distance) - rows.radii_m).argmin())]
+    x, y, z = (nearest[:, 1] - nearest[:, 0]).tolist()
     if x * x + y * y + z * z < 1e-12:  # at rest to each other: across the line between
-        x, y, z = (-nearest[0]).tolist()
+        x, y, z = (-nearest[:, 0]).tolist()
     level = math.hypot(x, y)
     length = math.hypot(level, z)
     right = (y / level, -x / level, 0.0) if level > 1e-6 * length else (1.0, 0.0, 0.0)

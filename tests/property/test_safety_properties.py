@@ -104,7 +104,7 @@ def test_tangents_bound_their_rows_from_below(inputs: FilterInput) -> None:
     at, elsewhere = rng.uniform(-3.0, 3.0, (2, 3))
     gradient, _ = rows.gradient(at, decay)
     values = [rise + decay[:, None] * psi for rise, psi in (rows.evaluate(at), rows.evaluate(elsewhere))]
-    assert (values[1] - values[0] - gradient @ (elsewhere - at) >= -1e-12).all()
+    assert (values[1] - values[0] - np.tensordot(elsewhere - at, gradient, 1) >= -1e-12).all()
 
 
 @given(scenes())
