@@ -82,7 +82,7 @@ class Flight:
             grounded = world.on_ground and autopilot.mode is Mode.OFFBOARD
             self.judge.step(self.t_ns, world.state.p_enu, world.clearance_m, grounded=grounded)
             if world.clearance_m < _NEAR_M or self.at_tick:
-                self.judge.approach(self.t_ns, world.state.p_enu, world.obstacle_positions(world.t_s))
+                self.judge.approach(self.t_ns, world.state.p_enu, world.obstacles_enu)
 
     def control(self) -> tuple[Reply, ...]:
         """The autopilot's look at the clock, once a control period."""
@@ -126,7 +126,7 @@ class Flight:
             "mode": self.autopilot.mode.name,
             "position": world.state.p_enu,
             "velocity": world.state.v_enu,
-            "obstacles": world.obstacle_positions(world.t_s),
+            "obstacles": world.obstacles_enu,
             "clearance_m": world.clearance_m if self._ids else None,
         }
 
@@ -151,4 +151,4 @@ class Flight:
         t_ns = self.t_ns
         for sensor in self._sensors.values():
             if t_ns >= sensor.next_ns:
-                sensor.sample(t_ns, self.world.obstacle_positions(self.world.t_s))
+                sensor.sample(t_ns, self.world.obstacles_enu)

@@ -95,7 +95,7 @@ class World:
         self._lag_down = -math.expm1(-1.0 / (physics_hz * vehicle.motor_down_s))
         self._client = pybullet.connect(pybullet.DIRECT)
         self._build(start_enu, start_yaw_rad)
-        self._obstacles_enu = self.obstacle_positions(0.0)
+        self.obstacles_enu = self.obstacle_positions(0.0)  # true centres at this step [m]
         self.state = self._read_state()
         self.clearance_m = self._clearance()
         self.min_clearance_m = self.clearance_m
@@ -218,15 +218,15 @@ class World:
         return [motion.velocity(motion_t_s) for motion in self.motions]
 
     def _move_obstacles(self) -> None:
-        self._obstacles_enu = self.obstacle_positions(self.t_s)
-        for sphere, p_enu in zip(self._spheres, self._obstacles_enu, strict=True):
+        self.obstacles_enu = self.obstacle_positions(self.t_s)
+        for sphere, p_enu in zip(self._spheres, self.obstacles_enu, strict=True):
             pybullet.resetBasePositionAndOrientation(sphere, p_enu, _LEVEL_XYZW, self._client)
 
     def _clearance(self) -> float:
         """min over obstacles of |p - p_o| - r_d - r_o [m]; inf without obstacles."""
         nearest = math.inf
         p_enu, radius_m = self.state.p_enu, self.vehicle.radius_m
-        for p_o_enu, r_o_m in zip(self._obstacles_enu, self.radii_m, strict=True):
+        for p_o_enu, r_o_m in zip(self.obstacles_enu, self.radii_m, strict=True):
             nearest = min(nearest, math.dist(p_enu, p_o_enu) - radius_m - r_o_m)
         return nearest
 
