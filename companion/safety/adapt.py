@@ -15,7 +15,6 @@ from companion.config import SafetyConfig
 from companion.types import FloatArray
 
 CLF_PERIOD_S = 0.05  # eta of (26) is applied once per this time
-_ONES = np.ones(3)
 _TINY = 1e-30  # stands for psi = 0: the row then asks for rise >= 0 alone
 
 
@@ -30,13 +29,11 @@ def epsilon_star(p_rel: FloatArray, v_rel: FloatArray, config: SafetyConfig) -> 
     Returns:
         (M,) in [0, 1 / alpha2].
     """
-    separation = (p_rel * v_rel) @ _ONES  # times |p_rel|
+    separation = np.vecdot(p_rel, v_rel)  # times |p_rel|
     np.maximum(separation, 0.0, out=separation)
-    if not separation.any():
-        return separation
     separation *= config.epsilon_max
-    separation /= np.maximum((p_rel * p_rel) @ _ONES, 1e-12)
-    return np.minimum(separation, 1.0 / config.alpha2, out=separation)
+    separation /= np.maximum(np.vecdot(p_rel, p_rel), 1e-12)
+    return np.asarray(np.minimum(separation, 1.0 / config.alpha2, out=separation))
 
 
 def clf_budget(previous: FloatArray, star: FloatArray, elapsed_s: FloatArray, eta: float) -> FloatArray:

@@ -36,7 +36,7 @@ def monomials(a: FloatArray) -> FloatArray:
     out = np.empty((5, len(a)))
     out[0] = 1.0
     out[1:4] = a.T
-    out[4] = (a * a) @ _HALVES
+    np.multiply(np.vecdot(a, a), 0.5, out=out[4])
     return out
 
 
@@ -126,7 +126,7 @@ class Barrier:
     def __init__(self, config: SafetyConfig) -> None:
         self._config = config
         steps = np.arange(config.horizon + 3)
-        self._time_s = steps * config.dt_s
+        self._time_s = (steps * config.dt_s)[:, None]
         self._reach: FloatArray = np.asarray(config.dt_s**2 * steps * (steps - 1) / 2.0, dtype=np.float64)
         square = self._reach**2
         decayed = square[1:] - (1.0 - config.alpha1) * square[:-1]
@@ -154,14 +154,13 @@ class Barrier:
             raise ValueError(f"prediction: expected {instants} instants (horizon + 3), got {prediction.p_enu.shape[1]}")
         sigma = self._sigma(prediction, p_std_m)
         relative = prediction.v_enu - v_enu
-        delay = config.sigma_delay_s * np.sqrt(2.0 * ((relative * relative) @ _HALVES))
+        delay = config.sigma_delay_s * np.sqrt(np.vecdot(relative, relative))
         radii = prediction.radius_m + config.drone_radius_m
         keep_out = sigma + (radii + delay + config.cushion_m)[:, None]
         if self._letter != 1.0:
             keep_out *= self._letter
-        path = p_enu[:, None] + v_enu[:, None] * self._time_s
         drift = np.empty((3, len(prediction), instants))
-        np.subtract(path[:, None], prediction.p_enu[:, :instants].transpose(2, 0, 1), out=drift)
+        np.subtract((p_enu + self._time_s * v_enu).T[:, None], prediction.p_enu[:, :instants].transpose(2, 0, 1), drift)
         coefficients = self._coefficients(drift, keep_out)
         return BarrierRows(
             ids=prediction.ids,
@@ -172,7 +171,7 @@ class Barrier:
             cushion_m=config.cushion_m,
             sigma_m=sigma,
             delay_m=delay,
-            least_decay=config.recovery * (coefficients[0, 1, :, 0] < 0.0),
+            least_decay=np.asarray((coefficients[0, 1, :, 0] < 0.0) * config.recovery, dtype=np.float64),
             keep_out_m=keep_out,
         )
 

@@ -60,7 +60,7 @@ class VehicleLimits:
     def slow(self, a: FloatArray) -> FloatArray:
         """How far each of ``a`` (C, 3) breaks the speed limit, 0 where it holds [m/s^2]."""
         v = self.v_enu + a * self.dt_s
-        speed = np.sqrt((v * v) @ np.ones(3))
+        speed = np.sqrt(np.vecdot(v, v))
         return np.asarray(np.maximum(speed - self.speed_bound_m_s, 0.0) / self.dt_s)
 
     def may_speed(self) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -44,13 +45,13 @@ def least_cost(task: Task, shared: Form, start: Found, order: tuple[str, ...]) -
         previous, before = a, best.cost
         tried = task.limits.clip(a + _STEPS * (x[:3] - a))
         verdict = judge(task, tried)
-        taken = int(np.where(verdict.admissible, verdict.cost, np.inf).argmin())
-        a = tried[taken]
+        taken = int(verdict.ranked.argmin())
+        a, cost = tried[taken], float(verdict.ranked[taken])
         epsilon = np.minimum(np.maximum(task.star, verdict.lower[taken]), verdict.upper[taken])
-        if verdict.admissible[taken] and verdict.cost[taken] < best.cost:
-            best = Found(a, epsilon, True, float(verdict.cost[taken]), count, solver)
+        if cost < best.cost:
+            best = Found(a, epsilon, True, cost, count, solver)
         if best.admissible and (
-            before - best.cost < SETTLED * best.cost or float(np.abs(a - previous).max()) < SETTLED_M_S2
+            before - best.cost < SETTLED * best.cost or max(map(abs, (a - previous).tolist())) < SETTLED_M_S2
         ):
             break
     return best
@@ -78,29 +79,36 @@ def form(task: Task) -> Form:
     linear[:3], linear[epsilons] = config.lambda_u * task.a_ref, config.lambda_epsilon * task.star
     low[:3], low[epsilons] = limits.low, task.rows.least_decay / config.alpha2
     high[:3], high[epsilons], high[deltas] = limits.high, 1.0 / config.alpha2, UNBOUNDED
-    every = count * (config.horizon + 1)
+    return Form(2.0 * weight, -2.0 * linear, low, high, *_places(count, config.horizon + 1))
+
+
+@lru_cache(maxsize=32)
+def _places(count: int, steps: int) -> tuple[FloatArray, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """``empty``, ``slopes`` and ``clf`` of a form: they depend on the number of obstacles and rows only."""
+    size, every = 3 + 2 * count, count * steps
     empty = np.zeros((every + count + 1, size))
     own, row = np.arange(count), np.arange(every)
     empty[every + own, 3 + count + own] = 1.0
-    slopes = row * size + 3 + row // (config.horizon + 1)
-    return Form(2.0 * weight, -2.0 * linear, low, high, empty, slopes, (every + own) * size + 3 + own)
+    empty.flags.writeable = False
+    return empty, row * size + 3 + row // steps, (every + own) * size + 3 + own
 
 
 def _tangent_program(task: Task, shared: Form, a: Vec3, epsilon: FloatArray) -> Program:
     """(29) about (a, epsilon): variables a, epsilon_j, delta_j."""
-    config, count = task.config, len(task.rows)
-    rise, psi = task.rows.evaluate(a)
-    normal, norm = task.rows.gradient(a, config.alpha2 * epsilon)
-    normal /= norm
-    normal = normal.reshape(3, -1)
-    every = normal.shape[1]
+    alpha2, every = task.config.alpha2, len(shared.slopes)
+    rise, psi = task.rows.evaluate(a).reshape(2, every)
+    gradient, norm = task.rows.gradient(a, alpha2 * epsilon)
+    entries = np.empty(
+        (5, every)
+    )  # normal, d row / d epsilon, floor: the row is affine in epsilon, so it cancels there
+    entries[:3] = gradient.reshape(3, every)
+    np.multiply(psi, alpha2, out=entries[3])
+    np.subtract(a @ entries[:3], rise, out=entries[4])
+    entries /= norm.reshape(every)
     rows, floors = shared.empty.copy(), np.empty(len(shared.empty))
-    rows[:every, :3] = normal.T
-    psi *= config.alpha2
-    psi /= norm  # d row / d epsilon
-    rows.reshape(-1)[shared.slopes] = psi.reshape(-1)
-    rise /= norm
-    np.subtract(a @ normal + INSET_M_S2, rise.reshape(-1), out=floors[:every])  # no epsilon: the row is affine in it
+    rows[:every, :3] = entries[:3].T
+    rows.reshape(-1)[shared.slopes] = entries[3]
+    np.add(entries[4], INSET_M_S2, out=floors[:every])
     deviation = epsilon - task.star
     tangent = 2.0 * deviation  # of (26): delta - tangent epsilon >= V - budget - tangent epsilon_0
     rows.reshape(-1)[shared.clf] = -tangent
@@ -120,7 +128,7 @@ def solve_task(task: Task, last: Vec3 | None, order: tuple[str, ...]) -> Found:
     """
     starts, shared = candidates(task, last), form(task)
     judgement = judge(task, starts)
-    ranked = np.where(judgement.admissible, judgement.cost, np.inf)
+    ranked = judgement.ranked
     found = least_cost(task, shared, _start(task, starts, judgement, 0), order)
     first = int(ranked.argmin())
     if ranked[first] < found.cost:

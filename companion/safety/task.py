@@ -65,6 +65,11 @@ class Judgement:
     admissible: npt.NDArray[np.bool_]  # (C,)
     cost: FloatArray  # (C,) with the cheapest epsilon
 
+    @property
+    def ranked(self) -> FloatArray:
+        """Cost where admissible, infinite elsewhere, (C,)."""
+        return np.where(self.admissible, self.cost, np.inf)
+
 
 def within_reach(rows: BarrierRows, limits: VehicleLimits) -> npt.NDArray[np.bool_]:
     """Obstacles that can bind: not those whose rows hold at decay 1 for every acceleration of the box, (M,).
@@ -91,22 +96,22 @@ def judge(task: Task, a: FloatArray) -> Judgement:
     delta = np.maximum(deviation - task.budget, 0.0)
     delta *= delta
     away = a - task.a_ref
-    cost = (away * away) @ np.full(3, config.lambda_u)
-    cost += deviation @ np.full(len(task.rows), config.lambda_epsilon)
-    cost += delta @ np.full(len(task.rows), config.lambda_delta)
+    priced = config.lambda_epsilon * deviation + config.lambda_delta * delta
+    cost = config.lambda_u * np.vecdot(away, away) + np.add.reduce(priced, axis=-1)
     return Judgement(lower, upper, admissible, cost)
 
 
 def candidates(task: Task, last: Vec3 | None) -> FloatArray:
     """Where a search may start, all inside box and arena: (C, 3)."""
-    box = task.limits.box_m_s2
-    starts = [task.a_ref[None], box * _LATTICE]
+    starts = [task.a_ref[None], _LATTICE]
+    if len(task.rows):
+        ring = _ring(task.rows)
+        starts += [ring, 0.5 * ring]
     if last is not None:
         starts.insert(0, last[None])
-    if len(task.rows):
-        ring = box * _ring(task.rows)
-        starts += [ring, 0.5 * ring]
-    return task.limits.clip(np.concatenate(starts))
+    together = np.concatenate(starts)
+    together[1 if last is None else 2 :] *= task.limits.box_m_s2
+    return task.limits.clip(together)
 
 
 def turned(rows: BarrierRows, a_ref: Vec3) -> Vec3:
