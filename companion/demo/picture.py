@@ -23,9 +23,10 @@ def draw(described: dict[str, Any], flight: FlightResult, path: Path) -> None:
     from matplotlib.figure import Figure
 
     trace = _trace(flight.trace)
-    figure = Figure(figsize=(12.0, 5.2), layout="constrained")
-    space = figure.add_subplot(1, 2, 1, projection="3d")
-    over_time = figure.add_subplot(1, 2, 2)
+    figure = Figure(figsize=(13.0, 5.2), layout="constrained")
+    grid = figure.add_gridspec(1, 2, width_ratios=(3, 2))
+    space = figure.add_subplot(grid[0], projection="3d")
+    over_time = figure.add_subplot(grid[1])
     _draw_space(space, described, flight, trace)
     _draw_clearance(over_time, described, flight, trace)
     outcome = "touched an obstacle" if flight.simulator["collided"] else "touched nothing"
@@ -63,11 +64,15 @@ def _draw_space(axes: Any, described: dict[str, Any], flight: FlightResult, trac
         axes.plot(*np.array([approach["p_enu"], approach["p_obstacle_enu"]]).T, color=colour, linewidth=1.0)
     points = np.concatenate([vehicle, obstacles.reshape(-1, 3)])
     low, high = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
+    low[2], high[2] = min(low[2], 0.5), max(high[2], 2.5)  # not so flat that the axis is unreadable
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low)
-    axes.set(xlabel="east [m]", ylabel="north [m]", zlabel="up [m]", title="path, obstacles at closest approach")
-    axes.view_init(elev=35.0, azim=-75.0)
-    axes.legend(loc="upper left", fontsize=8)
+    axes.set_box_aspect(high - low, zoom=1.12)
+    axes.set(ylabel="north [m]", zlabel="up [m]", title="path, obstacles at closest approach")
+    axes.set_xlabel("east [m]", labelpad=14.0)
+    axes.locator_params(axis="z", nbins=3)
+    axes.locator_params(axis="y", nbins=4)
+    axes.view_init(elev=42.0, azim=-78.0)
+    axes.legend(loc="upper left", fontsize=8, bbox_to_anchor=(0.0, 1.0))
 
 
 def _sphere(axes: Any, centre: list[float], radius_m: float, colour: str, label: str | None) -> None:
