@@ -20,6 +20,7 @@ from companion.types import FloatArray, Vec3
 
 BRAKING_SHARE = 0.7  # of the acceleration box, counted on for stopping at a wall
 RETURN_RATE_HZ = 1.0  # speed towards the arena per metre outside it
+_DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
 ROUNDING_M_S2 = 1e-9  # a reference clipped to the same box by someone else may differ in the last bits
 
 
@@ -35,6 +36,7 @@ class VehicleLimits:
     v_enu: Vec3  # [m/s]
     speed_bound_m_s: float
     dt_s: float
+    may_speed: bool = True  # whether an acceleration of the box can break the speed limit at all
 
     def slacks(self, a: Vec3) -> dict[str, float]:
         """Room left of each limit at ``a``, negative where broken [m/s^2]."""
@@ -58,15 +60,12 @@ class VehicleLimits:
         return self._speed_after(a) <= self.speed_bound_m_s
 
     def slow(self, a: FloatArray) -> FloatArray:
-        """How far each of ``a`` (C, 3) breaks the speed limit, 0 where it holds [m/s^2]."""
+        """How far each of ``a`` (C, 3), within the box, breaks the speed limit, 0 where it holds [m/s^2]."""
+        if not self.may_speed:
+            return np.zeros(len(a))
         v = self.v_enu + a * self.dt_s
         speed = np.sqrt(np.vecdot(v, v))
         return np.asarray(np.maximum(speed - self.speed_bound_m_s, 0.0) / self.dt_s)
-
-    def may_speed(self) -> bool:
-        """Whether any acceleration of the box breaks the speed limit; where none does, nobody needs to ask."""
-        gain = math.sqrt(3.0) * self.box_m_s2 * self.dt_s
-        return math.hypot(*self.v_enu.tolist()) + gain > self.speed_bound_m_s
 
     def speed_row(self, a: Vec3) -> tuple[FloatArray, float]:
         """The tangent of the speed limit at ``a`` as ``normal @ a >= floor``."""
@@ -109,6 +108,8 @@ def vehicle_limits(
             arena_low[axis], arena_high[axis] = (-down - v) / dt_s, (up - v) / dt_s
             low[axis] = min(max(arena_low[axis], -box), box)
             high[axis] = min(max(arena_high[axis], -box), box)
+    speed = math.hypot(*velocity)
+    bound = max(config.speed_m_s, speed - 0.5 * box * dt_s)
     return VehicleLimits(
         box_m_s2=box,
         low=np.array(low),
@@ -116,6 +117,7 @@ def vehicle_limits(
         arena_low=np.array(arena_low),
         arena_high=np.array(arena_high),
         v_enu=v_enu,
-        speed_bound_m_s=max(config.speed_m_s, math.hypot(*velocity) - 0.5 * box * dt_s),
+        speed_bound_m_s=bound,
         dt_s=dt_s,
+        may_speed=speed + _DIAGONAL * box * dt_s > bound,
     )

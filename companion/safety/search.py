@@ -113,7 +113,9 @@ def _tangent_program(task: Task, shared: Form, a: Vec3, epsilon: FloatArray) -> 
     tangent = 2.0 * deviation  # of (26): delta - tangent epsilon >= V - budget - tangent epsilon_0
     rows.reshape(-1)[shared.clf] = -tangent
     floors[every:-1] = deviation * deviation - task.budget - tangent * epsilon
-    rows[-1, :3], floors[-1] = task.limits.speed_row(a)
+    floors[-1] = -UNBOUNDED
+    if task.limits.may_speed:  # else the row cannot bind in the box: it stays empty
+        rows[-1, :3], floors[-1] = task.limits.speed_row(a)
     return Program(shared.weight, shared.linear, shared.low, shared.high, rows, floors)
 
 

@@ -88,7 +88,7 @@ def judge(task: Task, a: FloatArray) -> Judgement:
     lower /= config.alpha2
     upper /= config.alpha2
     admissible = np.logical_and.reduce(lower <= upper, axis=-1)
-    if task.limits.may_speed():
+    if task.limits.may_speed:
         admissible &= task.limits.slow(a) <= config.tolerance_m_s2
     deviation = np.minimum(np.maximum(task.star, lower), upper)
     deviation -= task.star
