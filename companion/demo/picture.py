@@ -66,9 +66,11 @@ def _draw_space(axes: Any, described: dict[str, Any], flight: FlightResult, trac
     low, high = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
     low[2], high[2] = min(low[2], 0.5), max(high[2], 2.5)  # not so flat that the axis is unreadable
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.12)
+    axes.set_box_aspect(high - low, zoom=1.25)
     axes.set(ylabel="north [m]", zlabel="up [m]", title="path, obstacles at closest approach")
     axes.set_xlabel("east [m]", labelpad=14.0)
+    for artist in (*axes.lines, *axes.collections):
+        artist.set_clip_on(False)  # enlarged, the box reaches beyond its frame
     axes.locator_params(axis="z", nbins=3)
     axes.locator_params(axis="y", nbins=4)
     axes.view_init(elev=42.0, azim=-78.0)
