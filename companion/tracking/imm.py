@@ -134,16 +134,21 @@ def birth(z: FloatArray, noise: FloatArray, constants: Constants) -> Bank:
 
 
 def markov(dt: FloatArray, constants: Constants) -> FloatArray:
-    """Pi(dt) = exp(G dt), G the generator of the symmetric per-step matrix: 1/3 + (I - 1/3) persistence^(dt / dt_s)."""
-    decay = constants.persistence ** (shared(dt) / constants.dt_s)
-    return np.asarray((1.0 - decay[:, None, None]) / MODELS + decay[:, None, None] * _EYE)
+    """Pi(dt) = exp(G dt), G the generator of the symmetric per-step matrix: 1/3 + (I - 1/3) persistence^(dt / dt_s).
+
+    Shapes: dt (M,) -> (M, 3, 3), or (1, 3, 3) where all share one dt.
+    """
+    dt_s = shared(dt)
+    steps = np.asarray(dt if dt_s is None else [dt_s]) / constants.dt_s
+    decay = (constants.persistence**steps)[:, None, None]
+    return np.asarray((1.0 - decay) / MODELS + decay * _EYE)
 
 
 def mix(bank: Bank, dt: FloatArray, constants: Constants) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Interaction (18): mixed (x0, P0) of each model and its prior probability c (M, 3)."""
-    transitions = markov(dt, constants)
-    prior = (bank.probabilities[:, None, :] @ transitions)[:, 0]
-    weights = (bank.probabilities[:, :, None] * transitions / prior[:, None, :]).swapaxes(1, 2)  # (M, to, from)
+    joint = markov(dt, constants) * bank.probabilities[:, None, :]  # (M, to, from), the Markov matrix being symmetric
+    prior = joint.sum(axis=2)
+    weights = joint / prior[..., None]
     x, covariance = to_common(bank.x, bank.covariance)
     if constants.turn_window == 0:
         # CV and CA know nothing of the turn rate: CT's own estimate stands for theirs, no surer than a new track's

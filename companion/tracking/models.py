@@ -10,6 +10,7 @@ covariance: CV uses 6 of the 10, CA 9, CT 7. Units: m, s, rad; frame: local ENU.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +37,7 @@ HAS_BLOCK = HAS[:, :, None] * HAS[:, None, :]  # (3, 10, 10)
 HAS_BLOCK.flags.writeable = False
 
 TURN_LIMIT_RAD_S = 10.0  # no obstacle of interest turns faster; keeps an absurd fix from winding CT up
-_SERIES_BELOW_RAD = 1e-3
+_SERIES_BELOW_RAD = 3e-4
 _TINY = float(np.finfo(np.float64).tiny)
 _ORDER = 5  # highest power of dt in F and Q
 _EXPONENTS = np.arange(_ORDER + 1.0)
@@ -50,7 +51,7 @@ TURN_WEIGHT = _WEIGHT[_RANK[:, None], _RANK[None, :]]  # (10, 10)
 TURN_WEIGHT.flags.writeable = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MotionModels:
     """Constants of the three models: F and Q as polynomials in dt, so that any dt of any track is one product."""
 
@@ -59,6 +60,15 @@ class MotionModels:
     accel_decay_hz: float  # 1 / accel_memory_s in predictions, 0: an acceleration lasts
     jerk_psd: float  # [m^2/s^5]
     prediction_noise: FloatArray  # (3, 6): coefficient of dt^n of each model's predicted position variance
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What `propagate` needs of dt alone; L = 1 where all tracks share it, else L = M."""
+
+    transition: FloatArray  # (L, 3, 10, 10) F, CT's rotation left out
+    noise: FloatArray  # (L, 3, 10, 10) Q, the turn's left out; zero going back in time
+    turn_noise: FloatArray  # (L, 10, 10) q dt W, see `turn_noise`
 
 
 def build_models(config: TrackingConfig) -> MotionModels:
@@ -123,17 +133,14 @@ def turn_terms(turn: FloatArray, dt: FloatArray) -> tuple[ComplexArray, ComplexA
 
         I = dt sinc(h) e^(ih),   dI/dOmega = i dt^2 e^(ih) (sinc(h) / 2 + i k(h)),   k = (sinc(h) - cos(h)) / (2 h)
 
-    with k = h / 6 - h^3 / 60 below |h| = 1e-3. Shapes: ``turn`` and ``dt`` broadcast.
+    with k = h / 6 below |h| = 3e-4. Shapes: ``turn`` and ``dt`` broadcast.
     """
-    h = 0.5 * turn * dt
-    h = np.where(h == 0.0, _TINY, h)
-    sine, cosine = np.sin(h), np.cos(h)
-    sinc = sine / h
-    k = np.where(np.abs(h) < _SERIES_BELOW_RAD, h * (1.0 / 6.0 - h * h / 60.0), (sinc - cosine) / (2.0 * h))
-    half = cosine + 1j * sine
-    integral = dt * sinc * half
-    slope = (dt * dt) * half * (0.5j * sinc - k)
-    return half * half, integral, slope
+    h = turn * (0.5 * dt) + _TINY  # never zero
+    half = np.exp(1j * h)
+    sinc = half.imag / h
+    k = np.where(np.abs(h) < _SERIES_BELOW_RAD, h * (1.0 / 6.0), (sinc - half.real) / (h + h))
+    moved = dt * half
+    return half * half, moved * sinc, moved * (dt * (0.5j * sinc - k))
 
 
 def propagate(
@@ -147,9 +154,9 @@ def propagate(
         new (x, covariance), same shapes.
     """
     count = x.shape[0]
-    both = np.empty((count, 2, MODELS, SIZE, SIZE))
-    both.reshape(count, 2 * _FLAT)[:] = (shared(dt)[:, None] ** _EXPONENTS) @ models.polynomials
-    jacobian, noise = both[:, 0], both[:, 1]
+    step = _shared_step(models, shared_s) if (shared_s := shared(dt)) is not None else _steps(models, dt)
+    jacobian = np.empty((count, MODELS, SIZE, SIZE))
+    jacobian[:] = step.transition
     rotation, integral, slope = turn_terms(x[:, CT, TURN], dt)
     horizontal = jacobian[:, CT, :6].reshape(count, 2, 3, SIZE)[:, :, :2]  # rows p_x, p_y and v_x, v_y
     turned = np.empty((count, 2), dtype=np.complex128)
@@ -157,21 +164,32 @@ def propagate(
     horizontal[..., 3:5] = (turned.view(np.float64) @ _AS_MATRIX).reshape(count, 2, 2, 2)
     moved = (jacobian @ x[..., None])[..., 0]
     w = horizontal_velocity(x)
-    turned[:, 0], turned[:, 1] = slope * w, 1j * dt * rotation * w
+    turned[:, 0], turned[:, 1] = slope * w, (1j * dt) * (rotation * w)
     horizontal[..., TURN] = turned.view(np.float64).reshape(count, 2, 2)
+    # a contiguous transpose: matmul takes three times as long over a swapped one
+    spread = (jacobian @ covariance) @ np.ascontiguousarray(jacobian.swapaxes(2, 3))
+    spread += step.noise
     if models.turn_psd > 0.0:
-        noise[:, CT] += turn_noise(jacobian[:, CT, :, TURN], dt, models.turn_psd)
-    if count and dt.min() < 0.0:
-        noise[dt < 0.0] = 0.0
-    spread = jacobian @ covariance @ jacobian.swapaxes(2, 3)
-    spread += noise
+        spread[:, CT] += turn_noise(jacobian[:, CT, :, TURN], step.turn_noise)
     return moved, spread
 
 
-def shared(dt: FloatArray) -> FloatArray:
-    """``dt`` (M,), or its one value (1,) where all tracks share it, as they do in a frame of one source."""
-    values = dt.tolist()
-    return dt[:1] if values and values.count(values[0]) == len(values) else dt
+def shared(dt: FloatArray) -> float | None:
+    """The one dt of all tracks, as in a frame of one source; None where they differ or there are no tracks."""
+    values: list[float] = dt.tolist()
+    return values[0] if values and values.count(values[0]) == len(values) else None
+
+
+@lru_cache(maxsize=64)
+def _shared_step(models: MotionModels, dt_s: float) -> Step:
+    """Steady flight asks for the same few dt again and again."""
+    return _steps(models, np.array([dt_s]))
+
+
+def _steps(models: MotionModels, dt: FloatArray) -> Step:
+    both = ((dt[:, None] ** _EXPONENTS) @ models.polynomials).reshape(-1, 2, MODELS, SIZE, SIZE)
+    both[:, 1][dt < 0.0] = 0.0
+    return Step(both[:, 0], both[:, 1], (models.turn_psd * np.maximum(dt, 0.0))[:, None, None] * TURN_WEIGHT)
 
 
 def horizontal_velocity(x: FloatArray) -> ComplexArray:
@@ -179,17 +197,18 @@ def horizontal_velocity(x: FloatArray) -> ComplexArray:
     return np.asarray(x[:, CT, 3] + 1j * x[:, CT, 4])
 
 
-def turn_noise(column: FloatArray, dt: FloatArray, turn_psd: float) -> FloatArray:
+def turn_noise(column: FloatArray, weight: FloatArray) -> FloatArray:
     """Q of a Wiener turn rate: Q = q dt (c c^T o W), c = d(state)/dOmega after dt, c_Omega = 1.
 
     W holds the ratios of the integrated noise to a constant error of the same size: 1/5 for position (v^2 q dt^5 / 20
     across the path), 1/3 for velocity (v^2 q dt^3 / 3), 1 for the rate. W is positive semidefinite, and so is Q
     (Schur product). Exact for a straight path, first order in Omega dt else.
 
-    Shapes: column (M, 10), dt (M,) -> (M, 10, 10).
+    Shapes: column (M, 10), weight q dt W (M or 1, 10, 10) -> (M, 10, 10).
     """
-    scaled = column * (turn_psd * np.maximum(dt, 0.0))[:, None]
-    return np.asarray(scaled[:, :, None] * column[:, None, :] * TURN_WEIGHT)
+    noise: FloatArray = column[:, :, None] * column[:, None, :]
+    noise *= weight
+    return noise
 
 
 def to_common(x: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -199,16 +218,15 @@ def to_common(x: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatA
     Shapes as in `propagate`; new arrays.
     """
     common, spread = x.copy(), covariance.copy()
-    count = x.shape[0]
     turn, v_x, v_y = x[:, CT, TURN], x[:, CT, 3], x[:, CT, 4]
-    common[:, CT, 6] = -turn * v_y
-    common[:, CT, 7] = turn * v_x
-    slope = np.zeros((count, 2, SIZE))
+    slope = np.zeros((x.shape[0], 2, SIZE))
     slope[:, 0, 4], slope[:, 0, TURN] = -turn, -v_y
     slope[:, 1, 3], slope[:, 1, TURN] = turn, v_x
-    rows = slope @ covariance[:, CT]
+    common[:, CT, 6], common[:, CT, 7] = slope[:, 0, 4] * v_y, turn * v_x
     ct = spread[:, CT]
+    rows = slope @ ct
+    columns = rows.swapaxes(1, 2)
     ct[:, 6:8, :] = rows
-    ct[:, :, 6:8] = rows.swapaxes(1, 2)
-    ct[:, 6:8, 6:8] = rows @ slope.swapaxes(1, 2)
+    ct[:, :, 6:8] = columns
+    ct[:, 6:8, 6:8] = slope @ columns
     return common, spread
