@@ -23,10 +23,9 @@ def draw(described: dict[str, Any], flight: FlightResult, path: Path) -> None:
     from matplotlib.figure import Figure
 
     trace = _trace(flight.trace)
-    figure = Figure(figsize=(13.0, 5.2), layout="constrained")
-    grid = figure.add_gridspec(1, 2, width_ratios=(3, 2))
-    space = figure.add_subplot(grid[0], projection="3d")
-    over_time = figure.add_subplot(grid[1])
+    figure = Figure(figsize=(13.0, 5.2))
+    space = figure.add_axes((0.0, 0.0, 0.6, 0.9), projection="3d")
+    over_time = figure.add_axes((0.66, 0.12, 0.32, 0.74))
     _draw_space(space, described, flight, trace)
     _draw_clearance(over_time, described, flight, trace)
     outcome = "touched an obstacle" if flight.simulator["collided"] else "touched nothing"
@@ -66,7 +65,7 @@ def _draw_space(axes: Any, described: dict[str, Any], flight: FlightResult, trac
     low, high = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
     low[2], high[2] = min(low[2], 0.5), max(high[2], 2.5)  # not so flat that the axis is unreadable
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.25)
+    axes.set_box_aspect(high - low, zoom=1.15)
     axes.set(ylabel="north [m]", zlabel="up [m]", title="path, obstacles at closest approach")
     axes.set_xlabel("east [m]", labelpad=14.0)
     for artist in (*axes.lines, *axes.collections):
