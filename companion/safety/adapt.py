@@ -58,7 +58,7 @@ def decay_interval(values: FloatArray, least: FloatArray) -> tuple[FloatArray, F
     bound = rise / (psi + np.copysign(_TINY, psi))  # less the decay at which the row is zero
     if opening.all():
         lower = np.maximum(0.0 - np.minimum.reduce(bound, axis=-1), least)
-        return lower, np.ones_like(lower)
+        return lower, np.ones(lower.shape)
     lower = np.maximum(0.0 - np.minimum.reduce(np.where(opening, bound, 0.0), axis=-1), least)
     upper = 0.0 - np.maximum.reduce(np.where(opening, -1.0, bound), axis=-1)
     return lower, np.minimum(upper, 1.0, out=upper)

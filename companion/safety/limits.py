@@ -108,14 +108,15 @@ def vehicle_limits(
             arena_low[axis], arena_high[axis] = (-down - v) / dt_s, (up - v) / dt_s
             low[axis] = min(max(arena_low[axis], -box), box)
             high[axis] = min(max(arena_high[axis], -box), box)
+    bounds = np.array((low, high, arena_low, arena_high))
     speed = math.hypot(*velocity)
     bound = max(config.speed_m_s, speed - 0.5 * box * dt_s)
     return VehicleLimits(
         box_m_s2=box,
-        low=np.array(low),
-        high=np.array(high),
-        arena_low=np.array(arena_low),
-        arena_high=np.array(arena_high),
+        low=bounds[0],
+        high=bounds[1],
+        arena_low=bounds[2],
+        arena_high=bounds[3],
         v_enu=v_enu,
         speed_bound_m_s=bound,
         dt_s=dt_s,

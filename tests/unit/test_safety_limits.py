@@ -119,3 +119,14 @@ def test_speed_row_of_a_vehicle_at_rest_asks_nothing() -> None:
     normal, floor = at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0)).speed_row(np.zeros(3))
     assert normal.tolist() == [0.0, 0.0, 0.0]
     assert floor < 0.0
+
+
+def test_the_speed_limit_is_asked_where_a_corner_of_the_box_breaks_it() -> None:
+    """At 45 degrees in all planes the corner gains sqrt(3) 3 m/s^2 0.05 s = 0.2598 m/s on a limit of 6 m/s."""
+    along = np.ones(3) / np.sqrt(3.0)
+    for speed, breaks in ((5.73, False), (5.75, True)):
+        limits = at((0.0, 0.0, 5.0), tuple(speed * along), arena_on=False)
+        corner = np.full((1, 3), 3.0)
+        assert limits.may_speed is breaks
+        assert (limits.slow(corner)[0] > 0.0) == breaks
+        assert (float(np.linalg.norm(limits.v_enu + 0.05 * corner)) > 6.0) == breaks
