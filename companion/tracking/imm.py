@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -51,7 +52,7 @@ _COFACTOR = np.array(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Constants:
     """What the bank needs besides a measurement."""
 
@@ -139,8 +140,16 @@ def markov(dt: FloatArray, constants: Constants) -> FloatArray:
     Shapes: dt (M,) -> (M, 3, 3), or (1, 3, 3) where all share one dt.
     """
     dt_s = shared(dt)
-    steps = np.asarray(dt if dt_s is None else [dt_s]) / constants.dt_s
-    decay = (constants.persistence**steps)[:, None, None]
+    return _markov(dt, constants) if dt_s is None else _shared_markov(dt_s, constants)
+
+
+@lru_cache(maxsize=64)
+def _shared_markov(dt_s: float, constants: Constants) -> FloatArray:
+    return _markov(np.array([dt_s]), constants)
+
+
+def _markov(dt: FloatArray, constants: Constants) -> FloatArray:
+    decay = (constants.persistence ** (dt / constants.dt_s))[:, None, None]
     return np.asarray((1.0 - decay) / MODELS + decay * _EYE)
 
 
@@ -157,7 +166,8 @@ def mix(bank: Bank, dt: FloatArray, constants: Constants) -> tuple[FloatArray, F
         covariance[:, :CT, TURN, TURN] = known[:, None]
     # second moments about CV's mean, so that metres from the origin do not cost digits
     offset = x - x[:, :1]
-    second = (covariance + offset[..., :, None] * offset[..., None, :]).reshape(len(bank), MODELS, SIZE * SIZE)
+    covariance += offset[..., :, None] * offset[..., None, :]
+    second = covariance.reshape(len(bank), MODELS, SIZE * SIZE)
     shift = weights @ offset
     mixed = (x[:, :1] + shift) * HAS
     spread = (weights @ second).reshape(len(bank), MODELS, SIZE, SIZE) - shift[..., :, None] * shift[..., None, :]
@@ -181,15 +191,15 @@ def correct(
     """
     d = z.shape[1]
     innovation = z[:, None, :] - x[..., :d]
-    to_measurement = covariance[..., :d]
     inverse, log_determinant = _invert(covariance[..., :d, :d] + noise[:, None])
-    weighted = inverse @ innovation[..., None]
-    nis = (innovation[..., None, :] @ weighted)[..., 0, 0]
-    gain = to_measurement @ inverse
-    updated = x + (to_measurement @ weighted)[..., 0]
+    gain = np.ascontiguousarray(covariance[..., :d]) @ inverse
+    shift = (gain @ innovation[..., None])[..., 0]
+    nis = (innovation[..., None, :] @ inverse @ innovation[..., None])[..., 0, 0]
     spread: FloatArray = covariance - gain @ covariance[..., :d, :]
     log_likelihood: FloatArray = -0.5 * (nis + log_determinant + d * _LOG_2PI)
-    return updated, 0.5 * (spread + spread.swapaxes(2, 3)), log_likelihood, nis
+    symmetric: FloatArray = spread + spread.swapaxes(2, 3)
+    symmetric *= 0.5
+    return x + shift, symmetric, log_likelihood, nis
 
 
 def _invert(s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -202,8 +212,8 @@ def _invert(s: FloatArray) -> tuple[FloatArray, FloatArray]:
         flat = np.ascontiguousarray(s).reshape(*s.shape[:-2], 9)
         f1, f2, f3, f4 = _COFACTOR
         cofactor = flat.take(f1, axis=-1) * flat.take(f2, axis=-1) - flat.take(f3, axis=-1) * flat.take(f4, axis=-1)
-        determinant = (flat[..., :3] * cofactor[..., :3]).sum(axis=-1)
-        if (determinant > _WELL_CONDITIONED * flat[..., ::4].prod(axis=-1)).all():
+        determinant = (flat[..., None, :3] @ cofactor[..., :3, None])[..., 0, 0]
+        if (determinant > _WELL_CONDITIONED * (flat[..., 0] * flat[..., 4] * flat[..., 8])).all():
             inverse: FloatArray = (cofactor / determinant[..., None]).reshape(s.shape)
             return inverse, np.log(determinant)
     return np.asarray(np.linalg.inv(s), dtype=np.float64), np.asarray(np.linalg.slogdet(s)[1])
@@ -276,11 +286,11 @@ def _turned(bank: Bank, mean: FloatArray, dt: FloatArray) -> FloatArray:
 
 def fuse_mean(x: FloatArray, probabilities: FloatArray) -> FloatArray:
     """Fused [p, v, a, Omega] (19), (M, 10), centripetal acceleration for CT."""
-    common = x.copy()
-    turn = x[:, CT, TURN]
-    common[:, CT, 6] = -turn * x[:, CT, 4]
-    common[:, CT, 7] = turn * x[:, CT, 3]
-    return np.asarray((probabilities[:, None, :] @ common)[:, 0])
+    mean: FloatArray = (probabilities[:, None, :] @ x)[:, 0]
+    turn = probabilities[:, CT] * x[:, CT, TURN]
+    mean[:, 6] -= turn * x[:, CT, 4]
+    mean[:, 7] += turn * x[:, CT, 3]
+    return mean
 
 
 def fuse(x: FloatArray, covariance: FloatArray, probabilities: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -59,19 +59,21 @@ def measure(detections: Sequence[Detection], config: TrackingConfig) -> Measurem
     for detection in detections:
         v = detection.v_enu if stated else None
         z.append([*detection.p_enu.tolist(), *(_NO_VELOCITY if v is None else v.tolist())])
-        p_m2 = detection.p_std_m**2 if stated and detection.p_std_m is not None else default_m2
-        v_m2_s2 = detection.v_std_m_s**2 if detection.v_std_m_s is not None else default_m2_s2
+        p_m2 = _held(detection.p_std_m**2 if stated and detection.p_std_m is not None else default_m2)
+        v_m2_s2 = _held(detection.v_std_m_s**2 if detection.v_std_m_s is not None else default_m2_s2)
         diagonal.append([p_m2, p_m2, p_m2, v_m2_s2, v_m2_s2, v_m2_s2])
     count = len(detections)
     noise = np.zeros((count, 6, 6))
-    noise.reshape(count, 36)[:, ::7] = np.minimum(
-        np.maximum(np.array(diagonal).reshape(count, 6), VARIANCE_MIN), VARIANCE_MAX
-    )
+    noise.reshape(count, 36)[:, ::7] = np.array(diagonal).reshape(count, 6)
     for row, detection in enumerate(detections):
         if detection.covariance is not None and stated:
             noise[row] = _bounded(detection.covariance)
     full = np.array([stated and d.v_enu is not None for d in detections], dtype=np.bool_)
     return Measurements(np.array(z).reshape(count, 6), noise, full, np.array([d.radius_m for d in detections]))
+
+
+def _held(variance: float) -> float:
+    return min(max(variance, VARIANCE_MIN), VARIANCE_MAX)
 
 
 def _bounded(covariance: FloatArray) -> FloatArray:

@@ -226,7 +226,5 @@ def to_common(x: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatA
     ct = spread[:, CT]
     rows = slope @ ct
     columns = rows.swapaxes(1, 2)
-    ct[:, 6:8, :] = rows
-    ct[:, :, 6:8] = columns
-    ct[:, 6:8, 6:8] = slope @ columns
+    ct[:, 6:8], ct[:, :, 6:8], ct[:, 6:8, 6:8] = rows, columns, slope @ columns
     return common, spread

@@ -207,7 +207,7 @@ class Tracker:
         if not rows.size:
             return
         z, noise = measurements.parts(full)
-        everything = rows.tolist() == list(range(len(self)))
+        everything = rows.tolist() == list(range(len(self)))  # as when a frame shows every track, the common case
         before = self._bank if everything else self._bank.take(rows)
         foreign = frame.kind is DetectionKind.TRACK
         after, nis = step(before, dt_ns / NS_PER_S, z, noise, self._constants, foreign=foreign)
