@@ -210,8 +210,8 @@ def _invert(s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     if s.shape[-1] == 3:
         flat = np.ascontiguousarray(s).reshape(*s.shape[:-2], 9)
-        f1, f2, f3, f4 = _COFACTOR
-        cofactor = flat.take(f1, axis=-1) * flat.take(f2, axis=-1) - flat.take(f3, axis=-1) * flat.take(f4, axis=-1)
+        f = flat.take(_COFACTOR, axis=-1)
+        cofactor = f[..., 0, :] * f[..., 1, :] - f[..., 2, :] * f[..., 3, :]
         determinant = (flat[..., None, :3] @ cofactor[..., :3, None])[..., 0, 0]
         if (determinant > _WELL_CONDITIONED * (flat[..., 0] * flat[..., 4] * flat[..., 8])).all():
             inverse: FloatArray = (cofactor / determinant[..., None]).reshape(s.shape)

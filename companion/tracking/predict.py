@@ -25,6 +25,7 @@ _LASTING, _MEANS, _ALL = 9, 15, 3 * _BASIS  # components of the e_k: of CV and C
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # of a symmetric 3x3: xx, yy, zz, yz, xz, xy
 _XY = 5
 _TINY = float(np.finfo(np.float64).tiny)
+_MEAN = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) / 3.0
 _NORM = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0]) / 6.0
 
 
@@ -133,12 +134,13 @@ def largest_sigma(entries: FloatArray) -> FloatArray:
 
     Shapes: xx, yy, zz, yz, xz, xy (M, 6, K) -> (M, K).
     """
-    mean = (entries[:, 0] + entries[:, 1] + entries[:, 2]) * (1.0 / 3.0)
+    mean = _MEAN @ entries
     c = entries.copy()
     c[:, :3] -= mean[:, None]
     squared = c * c
     scale = np.sqrt(_NORM @ squared)
-    half = 0.5 * (c[:, 0] * c[:, 1] * c[:, 2] - (c[:, :3] * squared[:, 3:]).sum(axis=1)) + c[:, 3] * c[:, 4] * c[:, 5]
+    product = c.reshape(len(c), 2, 3, c.shape[2]).prod(axis=2)  # of the diagonal, of the rest
+    half = 0.5 * (product[:, 0] - (c[:, :3] * squared[:, 3:]).sum(axis=1)) + product[:, 1]  # of the determinant
     cube = scale * scale * scale + _TINY
     ratio = np.minimum(np.maximum(half / cube, -1.0), 1.0)
     largest = mean + 2.0 * scale * np.cos(np.arccos(ratio) * (1.0 / 3.0))
