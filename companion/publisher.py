@@ -48,21 +48,28 @@ class Publisher:
     ) -> None:
         """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left."""
         self._verdict = record.verdict
-        self._zenoh.put("companion/setpoint", record)
+        payload = wire.encode(record)
+        self._zenoh.put_encoded("companion/setpoint", payload)
         table = tracks()
         self._tracks = len(table)
-        payloads: dict[str, msgspec.Struct] = {"companion/setpoint": record}
-        if self._recorder is not None or self._zenoh.wanted("companion/vehicle"):
-            payloads["companion/vehicle"] = vehicle_out(vehicle)
-            self._zenoh.put("companion/vehicle", payloads["companion/vehicle"])
-        if output is not None and (self._recorder is not None or self._zenoh.wanted("companion/tracks")):
-            payloads["companion/tracks"] = tracks_out(output, table)
-            self._zenoh.put("companion/tracks", payloads["companion/tracks"])
-        self._hash.tick(state, vehicle, frames, output, table)
         if self._recorder is not None:
             self._recorder.frames(frames, vehicle.stamp_ns)
-            for key, payload in payloads.items():
-                self._recorder.message(f"/{key}", vehicle.stamp_ns, wire.encode(payload))
+            self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
+        self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle))
+        if output is not None:
+            self._offer("companion/tracks", vehicle.stamp_ns, lambda: tracks_out(output, table))
+        self._hash.tick(state, vehicle, frames, output, table)
+
+    def _offer(self, key: str, stamp_ns: int, build: Callable[[], msgspec.Struct]) -> None:
+        """Build and encode once for whoever wants it: subscribers, the log, or nobody."""
+        wanted = self._zenoh.wanted(key)
+        if not wanted and self._recorder is None:
+            return
+        payload = wire.encode(build())
+        if wanted:
+            self._zenoh.put_encoded(key, payload)
+        if self._recorder is not None:
+            self._recorder.message(f"/{key}", stamp_ns, payload)
 
     def status(
         self,

@@ -146,8 +146,12 @@ class ZenohLink:
 
     def put(self, key: str, payload: wire.T) -> None:
         """Publish on ``{prefix}/key`` (one of ``wire.OUTGOING``'s companion keys) as JSON."""
+        self.put_encoded(key, wire.encode(payload))
+
+    def put_encoded(self, key: str, payload: bytes) -> None:
+        """Publish JSON that is encoded already."""
         if not self._closed:
-            self._publishers[key].put(wire.encode(payload))
+            self._publishers[key].put(payload)
 
     def wanted(self, key: str) -> bool:
         """Whether anyone subscribes to ``{prefix}/key``: what nobody reads need not be built."""
