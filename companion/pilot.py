@@ -94,12 +94,20 @@ class Pilot:
         self._observer.reset()
         self._commands: deque[tuple[int, Vec3]] = deque(maxlen=self._history_len)  # (acts from [ns], net a)
         self._last_ns: int | None = None
+        self._ahead: tuple[int, Prediction] | None = None  # what `observe` has prepared
         self._anchor: Vec3 | None = None
         self._task: Task | None = None
 
     def tracks(self) -> TrackTable:
         """The tracks as the last step left them; apart from it, because nobody waits for them."""
         return self._tracker.table()
+
+    def observe(self, frames: tuple[DetectionFrame, ...], stamp_ns: int) -> None:
+        """Track and predict for the tick of ``stamp_ns`` before its vehicle state is there.
+
+        Optional: `step` with the same stamp and frames then answers sooner, and the same to the bit.
+        """
+        self._ahead = (stamp_ns, self._track(frames, stamp_ns))
 
     def step(self, inputs: PilotInput, *, sent: bool = True) -> PilotOutput:
         """The safe acceleration for one tick.
@@ -111,17 +119,16 @@ class Pilot:
         """
         vehicle = inputs.vehicle
         elapsed_s = self._elapsed(vehicle)
-        self._tracker.update(inputs.frames, vehicle.stamp_ns)
-        start_ns = vehicle.stamp_ns + self._delay_ns
+        ahead, self._ahead = self._ahead, None
+        prepared = ahead is not None and ahead[0] == vehicle.stamp_ns
+        prediction = ahead[1] if ahead and prepared else self._track(inputs.frames, vehicle.stamp_ns)
         p_act, v_act = self._at_action(vehicle)
-        safety = self._config.safety
-        prediction = self._tracker.predict(start_ns, safety.horizon + 3, safety.dt_s)
         u_ref, valid = self._reference(inputs, p_act, v_act)
         flying = inputs.task is not Task.STAY
         disturbance = self._observer.update(vehicle.v_enu, elapsed_s, adapt=flying and sent)
         result = self._filtered(vehicle, p_act, v_act, u_ref, prediction, flying, elapsed_s)
         wire = frozen(result.a_safe - disturbance)
-        self._commands.append((start_ns, result.a_safe if sent else _ZERO))
+        self._commands.append((prediction.start_ns, result.a_safe if sent else _ZERO))
         self._observer.command(wire if sent else _ZERO, saturated=self._saturated(wire))
         return PilotOutput(
             stamp_ns=vehicle.stamp_ns,
@@ -139,13 +146,17 @@ class Pilot:
     ) -> FilterResult:
         """Filter a reference of your own (net, ENU [m/s^2]) instead of the policy's: the library's front door."""
         elapsed_s = self._elapsed(vehicle)
-        self._tracker.update(frames, vehicle.stamp_ns)
-        start_ns = vehicle.stamp_ns + self._delay_ns
+        prediction = self._track(frames, vehicle.stamp_ns)
         p_act, v_act = self._at_action(vehicle)
-        prediction = self._tracker.predict(start_ns, self._config.safety.horizon + 3, self._config.safety.dt_s)
         result = self._filtered(vehicle, p_act, v_act, frozen(a_ref), prediction, True, elapsed_s)
-        self._commands.append((start_ns, result.a_safe))
+        self._commands.append((prediction.start_ns, result.a_safe))
         return result
+
+    def _track(self, frames: tuple[DetectionFrame, ...], stamp_ns: int) -> Prediction:
+        """Obstacles from the instant on at which the setpoint for the tick of ``stamp_ns`` acts."""
+        self._tracker.update(frames, stamp_ns)
+        safety = self._config.safety
+        return self._tracker.predict(stamp_ns + self._delay_ns, safety.horizon + 3, safety.dt_s)
 
     def _elapsed(self, vehicle: VehicleState) -> float | None:
         if not (np.isfinite(vehicle.p_enu).all() and np.isfinite(vehicle.v_enu).all()):

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import gc
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,6 +69,15 @@ class Summary:
     log_hash: str
 
 
+@dataclass(frozen=True, slots=True)
+class _Ahead:
+    """A tick's frames, taken before its vehicle state was there."""
+
+    tick_ns: int
+    frames: tuple[DetectionFrame, ...]
+    spent_ns: int
+
+
 class Service:
     """One vehicle, one brain. ``run`` returns after ``stop``, and raises whatever else ended it."""
 
@@ -103,6 +113,7 @@ class Service:
         self._pending: VehicleState | None = None  # the newest state, not yet answered
         self._arrived_ns = 0  # its arrival, for the latency figure
         self._pending_since_ns = 0
+        self._ahead: _Ahead | None = None
         self._vehicle_ns = 0  # vehicle time of the newest state
         self._silent_since: dict[str, int] = {}
         self._policy_valid = True
@@ -166,6 +177,8 @@ class Service:
             if self._pending is not None and self._inputs_complete(self._pending):
                 vehicle, self._pending = self._pending, None
                 self._tick(vehicle)
+            elif self._pending is None and self._lockstep:
+                self._observe_ahead()
             self._housekeeping()
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
@@ -190,12 +203,24 @@ class Service:
             raise LockstepStalled(f"lockstep: no progress for 1 s at tick {vehicle.stamp_ns}: missing {missing}")
         return False
 
+    def _observe_ahead(self) -> None:
+        """In lockstep: the next tick's obstacles may be here before its vehicle state; track them meanwhile."""
+        tick_ns = self._inbox.complete_through_ns(self._config.lockstep_sources)
+        prepared_ns = -1 if self._ahead is None else self._ahead.tick_ns
+        if tick_ns is None or tick_ns <= max(self._vehicle_ns, prepared_ns) or self._faulty:
+            return
+        began_ns = stopwatch_ns()
+        frames = self._inbox.drain(tick_ns)
+        with self._fault_on_error():
+            self._pilot.observe(frames, tick_ns)
+        self._ahead = _Ahead(tick_ns, frames, stopwatch_ns() - began_ns)
+
     def _tick(self, vehicle: VehicleState) -> None:
         """One vehicle state in, one record out, and a setpoint where the state of the daemon sends one."""
         started_ns = stopwatch_ns()
         session = self._session
         session.poll(self._now_ns())
-        frames = self._inbox.drain(vehicle.stamp_ns, unix_minus_vehicle_ns=self._timesync.unix_minus_vehicle_ns)
+        frames, ahead_ns = self._take_frames(vehicle.stamp_ns)
         session.degraded(self._degradation(vehicle.stamp_ns))
         self._route.advance(vehicle.p_enu)
         output = self._think(vehicle, frames)
@@ -207,8 +232,9 @@ class Service:
         sent_ns = stopwatch_ns()
         timings_ms = {
             "queue": (started_ns - self._arrived_ns) / 1e6,
+            "ahead": ahead_ns / 1e6,  # spent on this tick before its state arrived, lockstep only
             "brain": (thought_ns - started_ns) / 1e6,
-            "total": (sent_ns - self._arrived_ns) / 1e6,
+            "total": (sent_ns - self._arrived_ns + ahead_ns) / 1e6,
         }
         record = setpoint_record(
             vehicle.stamp_ns, session.situation.state, output, sent=sent, messages=messages, timings_ms=timings_ms
@@ -216,23 +242,40 @@ class Service:
         self._publisher.tick(record, session.situation.state, vehicle, frames, output, self._pilot.tracks)
         self._meter.tick(timings_ms["total"], record.verdict)
 
+    def _take_frames(self, tick_ns: int) -> tuple[tuple[DetectionFrame, ...], int]:
+        """The frames of this tick, and the time that was spent on them before its state arrived [ns]."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and ahead.tick_ns == tick_ns:
+            return ahead.frames, ahead.spent_ns
+        return self._inbox.drain(tick_ns, unix_minus_vehicle_ns=self._timesync.unix_minus_vehicle_ns), 0
+
     def _think(self, vehicle: VehicleState, frames: tuple[DetectionFrame, ...]) -> PilotOutput | None:
         """The brain's answer, None in FAULT."""
         situation = self._session.situation
-        if situation.state is State.FAULT:
+        if self._faulty:
             return None
         task = _TASKS.get(situation.state, Task.STAY)
         inputs = PilotInput(vehicle=vehicle, frames=frames, task=task, target_enu=self._route.current)
-        try:
+        output = None
+        with self._fault_on_error():
             output = self._pilot.step(inputs, sent=self._session.streams and situation.external)
+            self._policy_valid = output.policy_valid
+        return output
+
+    @property
+    def _faulty(self) -> bool:
+        return self._session.situation.state is State.FAULT
+
+    @contextlib.contextmanager
+    def _fault_on_error(self) -> Iterator[None]:
+        """Whatever is wrong with the brain, the answer is FAULT."""
+        try:
+            yield
         except Exception as error:
             log.exception("the brain failed")
             self._session.fail(f"brain failed: {type(error).__name__}: {error}")
             self._pilot.reset()
             self._session.poll(self._now_ns())
-            return None
-        self._policy_valid = output.policy_valid
-        return output
 
     def _send_setpoint(self, vehicle: VehicleState, output: PilotOutput) -> None:
         self._transport.send(

@@ -88,9 +88,9 @@ class Flight:
         """The autopilot's look at the clock, once a control period."""
         return self.autopilot.step(self.world.state, self.t_ns)
 
-    def frames(self, source: str) -> list[Frame]:
-        """Frames of a sensor that have arrived by now."""
-        return self._sensors[source].due(self.t_ns)
+    def frames(self, source: str, t_ns: int) -> list[Frame]:
+        """Frames of a sensor that have arrived by ``t_ns``."""
+        return self._sensors[source].due(t_ns)
 
     @property
     def ended(self) -> str | None:

@@ -49,6 +49,10 @@ class Lockstep:
         self._desk = Desk(flight.resolved.scenario.operator)
         self._station = Station(flight, wires.router, clock_ns=lambda: flight.t_ns, lockstep=True)
         self._answer = Answer(-1, wires.bridge.record_key)
+        self._obstacles_ns = -1  # tick up to which frames and markers have left
+        # what every sensor will hand out at the next tick is measured already: it leaves before the physics
+        period_s = flight.resolved.period_ns / NS_PER_S
+        self._foresees = all(spec.latency_s >= period_s for spec in flight.resolved.scenario.sensors)
         self._companion_acks: dict[int, bytes] = {}  # by command
         self._stopped = False
         self._ends = flight.resolved.scenario.end.stop and not stay
@@ -102,20 +106,27 @@ class Lockstep:
 
     def _send(self) -> None:
         """Frames, markers, then the autopilot's messages with the state last."""
-        flight, bridge = self.flight, self._bridge
-        self._answer = Answer(flight.t_ns, bridge.record_key)
-        sent = dict.fromkeys((spec.source for spec in flight.resolved.scenario.sensors), 0)
-        for source, payload in due_frames(flight):
-            bridge.publish_frame(source, payload)
-            sent[source] += 1
-        for source, frames in sent.items():
-            bridge.publish_marker(source, flight.t_ns, frames)
+        flight = self.flight
+        self._answer = Answer(flight.t_ns, self._bridge.record_key)
+        self._send_obstacles(flight.t_ns)
         self._station.say(flight.control())
         self._station.announce()
         self._station.stream(self._wires.router.onboard)
         # the companion computes now: what it does not wait for is done beside it
         self._station.stream(self._wires.router.ground)
         self._trace.write(flight)
+
+    def _send_obstacles(self, tick_ns: int) -> None:
+        """The frames that are due at ``tick_ns`` and one marker a source, unless they have left already."""
+        if tick_ns <= self._obstacles_ns:
+            return
+        self._obstacles_ns = tick_ns
+        sent = dict.fromkeys((spec.source for spec in self.flight.resolved.scenario.sensors), 0)
+        for source, payload in due_frames(self.flight, tick_ns):
+            self._bridge.publish_frame(source, payload)
+            sent[source] += 1
+        for source, frames in sent.items():
+            self._bridge.publish_marker(source, tick_ns, frames)
 
     def _await_answer(self) -> None:
         answer = self._answer
@@ -129,6 +140,8 @@ class Lockstep:
 
     def _advance(self) -> None:
         flight = self.flight
+        if self._foresees:
+            self._send_obstacles(flight.t_ns + flight.resolved.period_ns)
         if self._offboard_wall is None and flight.autopilot.mode is Mode.OFFBOARD:
             self._offboard_wall = time.perf_counter()
         for _ in range(flight.resolved.control_steps):

@@ -162,14 +162,14 @@ class RealTime:
         bridge = self._wires.bridge
         if bridge is None:
             return
-        for source, payload in due_frames(self.flight):
+        for source, payload in due_frames(self.flight, self.flight.t_ns):
             bridge.publish_frame(source, payload)
 
 
-def due_frames(flight: Flight) -> Iterator[tuple[str, bytes]]:
-    """Encoded frames that have arrived by now, source by source."""
+def due_frames(flight: Flight, t_ns: int) -> Iterator[tuple[str, bytes]]:
+    """Encoded frames that have arrived by ``t_ns``, source by source."""
     for spec in flight.resolved.scenario.sensors:
-        for frame in flight.frames(spec.source):
+        for frame in flight.frames(spec.source, t_ns):
             yield spec.source, encode_frame(frame, spec.sigma_m)
 
 

@@ -102,6 +102,15 @@ class ObstacleInbox:
         """What `ready` waits for, in words; empty when nothing."""
         return "; ".join(text for source in sources if (text := self._missing(tick_ns, source)))
 
+    def complete_through_ns(self, sources: Iterable[str]) -> int | None:
+        """The newest tick for which `ready` is true, None where there is none."""
+        names = tuple(sources)
+        markers = [entry.through_ns for name in names if (entry := self._sources.get(name)) is not None]
+        if not names or len(markers) < len(names) or None in markers:
+            return None
+        tick_ns = min(marker for marker in markers if marker is not None)
+        return tick_ns if self.ready(tick_ns, names) else None
+
     def newest_stamp_ns(self, source: str) -> int | None:
         """Stamp of the newest frame accepted from ``source``, None where there was none."""
         entry = self._sources.get(source)

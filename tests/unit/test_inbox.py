@@ -184,3 +184,15 @@ def test_reset_forgets_the_old_clock(inbox: ObstacleInbox) -> None:
 def test_markers_in_messagepack(inbox: ObstacleInbox) -> None:
     inbox.push_marker("a", wire.encode(wire.SyncMarker(through_ns=5, frames=0), wire.MSGPACK), wire.MSGPACK)
     assert inbox.ready(5, ["a"])
+
+
+def test_the_newest_complete_tick_needs_every_source(inbox: ObstacleInbox) -> None:
+    assert inbox.complete_through_ns(()) is None
+    assert inbox.complete_through_ns(("a", "b")) is None
+    inbox.push_marker("a", marker(100 * MS, 0))
+    assert inbox.complete_through_ns(("a", "b")) is None
+    inbox.push_marker("b", marker(50 * MS, 1))
+    assert inbox.complete_through_ns(("a", "b")) is None  # a frame of b is still on its way
+    inbox.push("b", frame(20 * MS))
+    assert inbox.complete_through_ns(("a", "b")) == 50 * MS
+    assert inbox.complete_through_ns(("a",)) == 100 * MS

@@ -210,3 +210,27 @@ def test_a_constant_push_is_taken_off_the_wire() -> None:
         v = v + (wire + np.array([0.2, 0.0, -0.1])) * 0.05
     np.testing.assert_allclose(wire, [-0.2, 0.0, 0.1], atol=0.02)
     np.testing.assert_array_equal(output.result.a_safe, [0, 0, 0])
+
+
+def test_observing_ahead_changes_nothing_to_the_bit() -> None:
+    plain, ahead = pilot(Straight([2.0, 0.0, 0.0])), pilot(Straight([2.0, 0.0, 0.0]))
+    p, v = np.array([0.0, 0.0, 2.0]), np.zeros(3)
+    for k in range(60):
+        frames = (ball(k, [6.0, 0.02 * k, 2.0]),)
+        inputs = PilotInput(vehicle(k, p.tolist(), v.tolist()), frames, Task.FLY, frozen([9, 0, 2]))
+        expected = plain.step(inputs)
+        if k % 3:
+            ahead.observe(frames, k * TICK_NS)
+        output = ahead.step(inputs)
+        assert output.wire.tobytes() == expected.wire.tobytes()
+        assert output.prediction.p_enu.tobytes() == expected.prediction.p_enu.tobytes()
+        assert ahead.tracks().covariance.tobytes() == plain.tracks().covariance.tobytes()
+        p, v = p + v * 0.05, v + output.wire * 0.05
+
+
+def test_observing_for_another_tick_is_not_used() -> None:
+    brain = pilot(Straight([0.0, 0.0, 0.0]))
+    brain.observe((), 7 * TICK_NS)
+    output = brain.step(PilotInput(vehicle(8, [0, 0, 2]), (ball(8, [6, 0, 2]),)))
+    assert output.prediction.ids == ("radar/ball",)
+    assert output.prediction.start_ns >= 8 * TICK_NS
