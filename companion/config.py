@@ -7,7 +7,6 @@ An unknown key, a wrong type or a value out of range is a `ConfigError` whose on
 from __future__ import annotations
 
 import hashlib
-import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from companion.config_check import check_arena, check_tick, pointed
 from companion.errors import ConfigError
 from companion.profiles import PROFILES, Profile
 
@@ -52,7 +52,6 @@ class ZenohConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 class TargetConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     position: Point | None = None  # local ENU [m]; None: hold where engaged
-    yaw: float | None = None
 
 
 class EngageConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -234,9 +233,11 @@ def parse_config(raw: Mapping[str, Any], *, source: str = "configuration") -> Co
     try:
         config = msgspec.convert(merged, Config)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {_pointed(str(error))}") from None
-    _check_numbers(msgspec.to_builtins(config), source, "")
-    _check_relations(config, source)
+        raise ConfigError(f"{source}: {pointed(str(error))}") from None
+    check_tick(config.rate_hz, source)
+    check_arena(config.limits.arena_min, config.limits.arena_max, config.target.position, source)
+    if config.sync == "none" and config.lockstep_sources:
+        raise ConfigError(f'{source}: lockstep_sources: expected only with sync = "lockstep"')
     return config
 
 
@@ -276,44 +277,3 @@ def config_hash(config: Config) -> str:
     values = msgspec.to_builtins(config)
     values.pop("log")
     return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()
-
-
-def _pointed(message: str) -> str:
-    """``Expected `float`... - at `$.safety.alpha1` `` -> ``safety.alpha1: Expected `float`...``."""
-    text, at, path = message.rpartition(" - at `$")
-    if not at:
-        return message
-    return f"{path.rstrip('`').lstrip('.')}: {text}" if path.rstrip("`") else text
-
-
-def _check_numbers(value: Any, source: str, path: str) -> None:
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            _check_numbers(item, source, f"{path}.{key}" if path else key)
-    elif isinstance(value, list | tuple):
-        for item in value:
-            _check_numbers(item, source, path)
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{source}: {path}: expected a finite number, got {value}")
-
-
-def _check_relations(config: Config, source: str) -> None:
-    limits = config.limits
-    for axis, low, high in zip("xyz", limits.arena_min, limits.arena_max, strict=True):
-        if low >= high:
-            raise ConfigError(
-                f"{source}: limits.arena_min: expected below arena_max on axis {axis}, got {low} >= {high}"
-            )
-    if 1000 % config.rate_hz:
-        raise ConfigError(
-            f"{source}: tick_hz: expected a control period of whole milliseconds, got {config.rate_hz} Hz"
-        )
-    target = config.target.position
-    if target is not None:
-        for axis, low, value, high in zip("xyz", limits.arena_min, target, limits.arena_max, strict=True):
-            if not low <= value <= high:
-                raise ConfigError(
-                    f"{source}: target.position: expected {axis} inside limits.arena [{low}, {high}], got {value}"
-                )
-    if config.sync == "none" and config.lockstep_sources:
-        raise ConfigError(f'{source}: lockstep_sources: expected only with sync = "lockstep"')

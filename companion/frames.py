@@ -24,9 +24,6 @@ def enu_from_ned(v_ned: npt.ArrayLike) -> Vec3:
     return np.array([y, x, -z])
 
 
-ned_from_enu = enu_from_ned
-
-
 def enu_covariance_from_ned(covariance_ned: FloatArray) -> FloatArray:
     """A (3, 3) or (6, 6) covariance over [p] or [p, v], NED axes to ENU axes."""
     block = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -73,9 +70,3 @@ def rotate(q_a_from_b: npt.ArrayLike, v_b: npt.ArrayLike) -> Vec3:
     u = np.array([x, y, z])
     v = np.asarray(v_b, dtype=np.float64)
     return np.asarray(v + 2.0 * w * np.cross(u, v) + 2.0 * np.cross(u, np.cross(u, v)))
-
-
-def yaw_enu(q_enu: npt.ArrayLike) -> float:
-    """Heading of the body's x axis, counter-clockwise from east [rad]."""
-    w, x, y, z = np.asarray(q_enu, dtype=np.float64)
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

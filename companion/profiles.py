@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 MASK_ACCELERATION = 0x0C3F  # yaw and yaw rate ignored
 MASK_ACCELERATION_YAW_RATE = 0x043F  # acceleration and yaw rate
-MASK_VELOCITY_ACCELERATION = 0x0C07  # velocity and acceleration, yaw ignored
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,6 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 Vec3: TypeAlias = npt.NDArray[np.float64]  # shape (3,)
 
 NS_PER_S = 1_000_000_000
-G_M_S2 = 9.8  # Table 2 of the paper
 
 
 def frozen(values: npt.ArrayLike) -> FloatArray:

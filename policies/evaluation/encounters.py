@@ -18,7 +18,6 @@ import msgspec
 import numpy as np
 
 from companion.config import Config
-from companion.policy import load_policy
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.tracking.tracker import Tracker
 from companion.types import (
@@ -122,14 +121,6 @@ def stand_in_reference(limit_m_s2: float, speed_m_s: float) -> Reference:
         return np.asarray(a * min(1.0, limit_m_s2 / max(float(np.abs(a).max()), 1e-9)))
 
     return act
-
-
-def shipped_reference(config: Config) -> Reference:
-    """The policy of the configuration, clipped as the pilot clips it: the limit less the disturbance's reserve."""
-    policy = load_policy(config.policy, config.limits)
-    reserve = config.disturbance.bound_m_s2 if config.disturbance.enabled else 0.0
-    limit = config.limits.acceleration_m_s2 - reserve
-    return lambda v_enu, e_enu: np.clip(policy.act(v_enu, e_enu), -limit, limit)
 
 
 class _Loop:

@@ -16,12 +16,12 @@ PACKAGES = ("companion", "sim_bridge", "policies")
 LAYERS = [
     {"companion", "companion.__version__", "companion.types", "companion.errors"},
     {"companion.frames", "companion.profiles", "companion.clock"},
-    {"companion.config"},
+    {"companion.config", "companion.config_check"},
     {"companion.tracking", "companion.safety", "companion.policy", "companion.torch_backend", "companion.disturbance"},
     {"companion.pilot"},
     {"companion.state"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
-    {"companion.session", "companion.publisher", "companion.doors"},
+    {"companion.session", "companion.thinker", "companion.publisher", "companion.doors"},
     {"companion.service", "companion.publish", "companion.demo"},
     {"companion.cli"},
 ]

@@ -38,8 +38,8 @@ def test_attitude_against_scipy() -> None:
 @pytest.mark.parametrize(("yaw_ned_deg", "yaw_enu_deg"), [(0, 90), (90, 0), (180, -90), (-90, 180), (45, 45)])
 def test_heading(yaw_ned_deg: float, yaw_enu_deg: float) -> None:
     half = np.radians(yaw_ned_deg) / 2.0
-    yaw = frames.yaw_enu(frames.q_enu_from_flu([np.cos(half), 0.0, 0.0, np.sin(half)]))
-    difference = (np.degrees(yaw) - yaw_enu_deg + 180.0) % 360.0 - 180.0
+    nose = frames.rotate(frames.q_enu_from_flu([np.cos(half), 0.0, 0.0, np.sin(half)]), [1.0, 0.0, 0.0])
+    difference = (np.degrees(np.arctan2(nose[1], nose[0])) - yaw_enu_deg + 180.0) % 360.0 - 180.0
     assert abs(difference) < 1e-9
 
 

@@ -1,0 +1,37 @@
+"""What the types of the configuration cannot say, and how a mistake is put: one line ``source: key: expectation``."""
+
+from __future__ import annotations
+
+from companion.errors import ConfigError
+
+Point = tuple[float, float, float]
+
+
+def pointed(message: str) -> str:
+    """``Expected `float`... - at `$.safety.alpha1` `` -> ``safety.alpha1: Expected `float`...``."""
+    text, at, path = message.rpartition(" - at `$")
+    if not at:
+        return message
+    return f"{path.rstrip('`').lstrip('.')}: {text}" if path.rstrip("`") else text
+
+
+def check_arena(low: Point, high: Point, target: Point | None, source: str) -> None:
+    """Raise ConfigError unless the arena is a box and the target, where there is one, lies in it."""
+    for axis, lower, upper in zip("xyz", low, high, strict=True):
+        if lower >= upper:
+            raise ConfigError(
+                f"{source}: limits.arena_min: expected below arena_max on axis {axis}, got {lower} >= {upper}"
+            )
+    if target is None:
+        return
+    for axis, lower, value, upper in zip("xyz", low, target, high, strict=True):
+        if not lower <= value <= upper:
+            raise ConfigError(
+                f"{source}: target.position: expected {axis} inside limits.arena [{lower}, {upper}], got {value}"
+            )
+
+
+def check_tick(rate_hz: int, source: str) -> None:
+    """Raise ConfigError unless the control period is whole milliseconds: setpoints carry such stamps."""
+    if 1000 % rate_hz:
+        raise ConfigError(f"{source}: tick_hz: expected a control period of whole milliseconds, got {rate_hz} Hz")
