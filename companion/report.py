@@ -26,36 +26,20 @@ def setpoint_record(
     timings_ms: Mapping[str, float],
 ) -> SetpointRecord:
     """The intervention record of one tick; without an ``output`` the verdict is ``silent``."""
-    if output is None:
-        return SetpointRecord(
-            stamp_ns=stamp_ns,
-            sent=sent,
-            messages=messages,
-            state=state.value,
-            verdict=Verdict.SILENT.value,
-            u_ref=None,
-            u_safe=None,
-            wire=None,
-            rows=[],
-            worst=None,
-            disturbance=(0.0, 0.0, 0.0),
-            tracks=0,
-            timings_ms=dict(timings_ms),
-        )
-    result = output.result
+    result = None if output is None else output.result
     return SetpointRecord(
         stamp_ns=stamp_ns,
         sent=sent,
         messages=messages,
         state=state.value,
-        verdict=result.verdict.value,
-        u_ref=_vec(output.u_ref),
-        u_safe=_vec(result.a_safe),
-        wire=_vec(output.wire) if sent else None,
-        rows=[_row(row) for row in result.rows],
-        worst=None if result.worst is None else _row(result.worst),
-        disturbance=_vec(output.disturbance),
-        tracks=len(output.prediction),
+        verdict=(Verdict.SILENT if result is None else result.verdict).value,
+        u_ref=None if output is None else _vec(output.u_ref),
+        u_safe=None if result is None else _vec(result.a_safe),
+        wire=_vec(output.wire) if output is not None and sent else None,
+        rows=[] if result is None else [_row(row) for row in result.rows],
+        worst=None if result is None or result.worst is None else _row(result.worst),
+        disturbance=(0.0, 0.0, 0.0) if output is None else _vec(output.disturbance),
+        tracks=0 if output is None else len(output.prediction),
         timings_ms=dict(timings_ms),
     )
 

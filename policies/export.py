@@ -43,11 +43,15 @@ def axis_shared_onnx(weights: Arrays) -> bytes:
     (the normaliser), one is g's first layer for +x, +y, +z, -x, -y, -z, and the hidden layer works on six rows.
     Inside it is float64, so that the order of additions leaves no trace in the float32 that comes out.
     """
+    return _serialised(_nodes(), _constants(weights))
+
+
+def _constants(weights: Arrays) -> dict[str, npt.NDArray[Any]]:
     odd, even = weights["odd.weight"].astype(np.float64), weights["even.weight"].astype(np.float64)
     per_axis = np.vstack([np.kron(np.eye(3), odd[:, k]) for k in range(3)])  # (9, 3 H): rows v, e, fine
     unit = np.kron(np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 1.0, FINE]]), np.eye(3))  # v, e, v + e, FINE e
     width = weights["hidden.bias"].shape[0]
-    constants: dict[str, npt.NDArray[Any]] = {
+    return {
         "scale_w": unit / weights["scale"].astype(np.float64)[:, None],
         "sum_w": np.kron(np.eye(3), np.ones((3, 1))),
         "first_w": np.vstack([np.hstack([per_axis, -per_axis]), np.tile(even.T, 6)]),
@@ -61,8 +65,11 @@ def axis_shared_onnx(weights: Arrays) -> bytes:
         "rows": np.array([-1, width], dtype=np.int64),
         "whole": np.array([-1, 6 * width], dtype=np.int64),
     }
+
+
+def _nodes() -> list[onnx.NodeProto]:
     node = helper.make_node
-    nodes = [
+    return [
         node("Cast", ["observation"], ["wide"], to=TensorProto.DOUBLE),
         node("MatMul", ["wide", "scale_w"], ["scaled"]),
         node("Split", ["scaled", "parts"], ["v_e", "v_plus_e", "fine_e"], axis=1),
@@ -84,7 +91,6 @@ def axis_shared_onnx(weights: Arrays) -> bytes:
         node("Clip", ["raw", "low", "high"], ["clipped"]),
         node("Cast", ["clipped"], ["action"], to=TensorProto.FLOAT),
     ]
-    return _serialised(nodes, constants)
 
 
 def _serialised(nodes: list[onnx.NodeProto], constants: Mapping[str, npt.NDArray[Any]]) -> bytes:

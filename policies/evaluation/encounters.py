@@ -31,6 +31,7 @@ from companion.types import (
     Verdict,
     frozen,
 )
+from policies.evaluation.obstacles import Obstacle, crossing_obstacle
 
 TICK_S = 0.05
 SUBSTEPS = 10
@@ -39,36 +40,8 @@ REACHED_M = 0.3
 DWELL_S = 1.0  # the target counts as reached where the vehicle then stays within REACHED_M for this long
 TIME_OUT_S = 30.0
 WARM_UP_S = 1.0  # the sensor runs this long before the flight, as it does while a vehicle takes off
-MOTIONS = ("linear", "accelerating", "eight")
 
 Reference = Callable[[Vec3, Vec3], Vec3]  # (v_enu, e_enu) -> net acceleration [m/s^2]
-
-
-@dataclass(frozen=True, slots=True)
-class Obstacle:
-    """One sphere. At ``crossing_s`` it is at ``p_enu`` with velocity ``v_enu``."""
-
-    motion: str
-    crossing_s: float
-    p_enu: Vec3  # [m]
-    v_enu: Vec3  # [m/s]
-    bend_enu: Vec3  # accelerating: acceleration [m/s^2]; eight: unit vector across v_enu
-    rate_rad_s: float = 0.0  # eight only
-    radius_m: float = 0.2
-
-    def position(self, t_s: FloatArray) -> FloatArray:
-        """Centre at ``t_s`` (...,), ENU (..., 3) [m]. An eight is A (sin wt, sin 2wt) about its own centre."""
-        t = np.asarray(t_s)[..., None] - self.crossing_s
-        if self.motion == "linear":
-            return self.p_enu + self.v_enu * t
-        if self.motion == "accelerating":
-            return self.p_enu + self.v_enu * t + 0.5 * self.bend_enu * t * t
-        w = self.rate_rad_s
-        speed = float(np.linalg.norm(self.v_enu))
-        along = self.v_enu / speed
-        size = speed / (math.sqrt(2.0) * w)  # both parts start with the same speed: the path crosses at 45 degrees
-        one, two = (along + self.bend_enu) / math.sqrt(2.0), (along - self.bend_enu) / math.sqrt(2.0)
-        return self.p_enu + size * (one * np.sin(w * t) + two * 0.5 * np.sin(2.0 * w * t))
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +164,6 @@ def fly(
     p, v, a = encounter.start_enu, np.zeros(3), np.zeros(3)
     inside_since: float | None = None
     correction = np.zeros(3)
-    keep = math.exp(-TICK_S / SUBSTEPS / LAG_S)
-    h = TICK_S / SUBSTEPS
     radii = np.array([config.safety.drone_radius_m + o.radius_m for o in encounter.obstacles])
     for step in range(round(TIME_OUT_S / TICK_S)):
         a_ref, result = loop.tick(step, p, v, encounter.obstacles)
@@ -203,13 +174,9 @@ def fly(
         if observe is not None:
             observe(step, p, v, a_ref, result)
         flight.path.append(p)
-        path = np.empty((SUBSTEPS, 3))
-        for substep in range(SUBSTEPS):
-            a = command + (a - command) * keep
-            v = v + a * h
-            p = p + v * h
-            path[substep] = p
-        times: FloatArray = step * TICK_S + h * np.arange(1.0, SUBSTEPS + 1.0)
+        path, v, a = _follow(command, p, v, a)
+        p = path[-1]
+        times: FloatArray = step * TICK_S + TICK_S / SUBSTEPS * np.arange(1.0, SUBSTEPS + 1.0)
         for obstacle, reach in zip(encounter.obstacles, radii, strict=True):
             gap = np.linalg.norm(path - obstacle.position(times), axis=-1).min() - reach
             flight.clearance_m = min(flight.clearance_m, float(gap))
@@ -219,6 +186,19 @@ def fly(
             flight.time_s = float(inside_since)
             break
     return flight
+
+
+def _follow(command: Vec3, p: Vec3, v: Vec3, a: Vec3) -> tuple[FloatArray, Vec3, Vec3]:
+    """One tick of the point mass: positions (SUBSTEPS, 3) [m], then velocity and acceleration at its end."""
+    h = TICK_S / SUBSTEPS
+    keep = math.exp(-h / LAG_S)
+    path = np.empty((SUBSTEPS, 3))
+    for substep in range(SUBSTEPS):
+        a = command + (a - command) * keep
+        v = v + a * h
+        p = p + v * h
+        path[substep] = p
+    return path, v, a
 
 
 def make_encounter(seed: int, count: int, config: Config, reference: Reference) -> Encounter:
@@ -238,7 +218,7 @@ def make_encounter(seed: int, count: int, config: Config, reference: Reference) 
         path = np.array(free.path)
         obstacles: list[Obstacle] = []
         while len(obstacles) < count:
-            obstacle = _obstacle(rng, path, free.time_s)
+            obstacle = crossing_obstacle(rng, path, free.time_s, TICK_S)
             early = np.arange(0.0, 1.0, TICK_S)
             gap_start = np.linalg.norm(obstacle.position(early) - start, axis=-1).min()
             after = free.time_s + np.arange(0.0, 6.0, TICK_S)
@@ -248,18 +228,6 @@ def make_encounter(seed: int, count: int, config: Config, reference: Reference) 
         encounter = Encounter(seed, start, target, tuple(obstacles))
         if fly(Encounter(seed, start, target, (obstacles[0],)), unfiltered, reference, Sensor()).clearance_m < 0.0:
             return encounter
-
-
-def _obstacle(rng: np.random.Generator, path: FloatArray, time_s: float) -> Obstacle:
-    crossing_s = rng.uniform(0.25, 0.75) * time_s
-    p = path[min(round(crossing_s / TICK_S), len(path) - 1)] + rng.uniform(-0.1, 0.1, 3)
-    v = rng.standard_normal(3) * (1.0, 1.0, 0.4)
-    v *= rng.uniform(0.5, 3.0) / np.linalg.norm(v)
-    across = np.cross(v, rng.standard_normal(3))
-    across /= np.linalg.norm(across)
-    motion = MOTIONS[int(rng.integers(len(MOTIONS)))]
-    bend = across if motion == "eight" else rng.uniform(-1.0, 1.0) * v / np.linalg.norm(v)
-    return Obstacle(motion, crossing_s, frozen(p), frozen(v), frozen(bend), rate_rad_s=rng.uniform(0.5, 1.2))
 
 
 def _with_filter(config: Config, name: str) -> Config:
