@@ -28,11 +28,10 @@ from sim_bridge.messages import (
 )
 from sim_bridge.parameters import Parameters
 from sim_bridge.physics import BodyState
-from sim_bridge.setpoints import VELOCITY_IGNORED, YAW_IGNORED, YAW_RATE_IGNORED, refusal
+from sim_bridge.setpoints import YAW_IGNORED, YAW_RATE_IGNORED
+from sim_bridge.stream import SetpointStream, acceleration
 
 HOME_ALTITUDE_AMSL_M = 488.0  # PX4 SITL's home, Zurich
-STREAM_GAP_NS = NS_PER_S // 2  # 2 Hz
-STREAM_NS = 450_000_000  # half a second of stream, less one period of 20 Hz for jitter
 LANDED_NS = NS_PER_S // 2  # at rest on the ground for this long
 HOVER_NS = NS_PER_S // 2
 REST_M_S = 0.1
@@ -60,15 +59,12 @@ class Autopilot:
         self.mode = Mode.HOLD
         self.armed = airborne
         self.landed = Landed.IN_AIR if airborne else Landed.ON_GROUND
-        self.last_setpoint: LocalSetpoint | None = None
+        self._stream = SetpointStream()
         self._rest_z_m = rest_height_m
         self._yaw_rad = yaw_rad
         # what every mode but OFFBOARD flies to
         self._goal: PositionSetpoint | None = PositionSetpoint(start_enu, yaw_rad) if airborne else None
         self._armed_ns = 0
-        self._stream_start_ns = 0
-        self._last_setpoint_ns: int | None = None
-        self._refused_ns: int | None = None
         self._rest_since_ns: int | None = None
         self._hover_since_ns: int | None = None
         self._handlers: dict[int, Callable[[Command, BodyState, int], tuple[Result, str]]] = {
@@ -89,23 +85,20 @@ class Autopilot:
 
     def setpoint(self, setpoint: LocalSetpoint, t_ns: int) -> tuple[Reply, ...]:
         """Take an external setpoint; one that cannot be flown is dropped whole and does not count as stream."""
-        reason = refusal(setpoint)
-        if reason:
-            if self._refused_ns is not None and t_ns - self._refused_ns < NS_PER_S:
-                return ()
-            self._refused_ns = t_ns
-            return (Text(Severity.WARNING, f"Setpoint refused: {reason}"),)
-        last = self._last_setpoint_ns
-        if last is None or t_ns - last > STREAM_GAP_NS:
-            self._stream_start_ns = t_ns
-        self._last_setpoint_ns = t_ns
-        self.last_setpoint = setpoint
-        return ()
+        return self._stream.take(setpoint, t_ns)
+
+    @property
+    def last_setpoint(self) -> LocalSetpoint | None:
+        return self._stream.last
+
+    def streaming(self, t_ns: int) -> bool:
+        """A setpoint stream of at least 2 Hz has run for half a second."""
+        return self._stream.proven(t_ns)
 
     def step(self, state: BodyState, t_ns: int) -> tuple[Reply, ...]:
         """Watch the clock once a control period: failsafe, takeoff, landing, disarming."""
         replies: list[Reply] = []
-        if self.mode is Mode.OFFBOARD and self.armed and self._setpoint_lost(t_ns):
+        if self.mode is Mode.OFFBOARD and self.armed and self._stream.lost(t_ns, self.parameters["COM_OF_LOSS_T"]):
             replies.append(self._lose_offboard(state))
         if self.armed:
             self._watch_ground(state, t_ns)
@@ -122,7 +115,8 @@ class Autopilot:
         if self.mode is Mode.OFFBOARD and setpoint is not None:
             if self.landed is Landed.ON_GROUND and setpoint.a_enu[2] < LIFT_OFF_M_S2:
                 return MotorsOff()
-            return AccelerationSetpoint(self._acceleration(setpoint, state), self._yaw_rad)
+            a_enu = acceleration(setpoint, state.v_enu, gain_per_s=self.parameters["MPC_XY_VEL_P_ACC"])
+            return AccelerationSetpoint(a_enu, self._yaw_rad)
         if self._goal is None or (self.landed is Landed.ON_GROUND and self.mode is not Mode.TAKEOFF):
             return MotorsOff()
         return self._goal
@@ -144,11 +138,6 @@ class Autopilot:
     @property
     def airborne(self) -> bool:
         return self.landed is not Landed.ON_GROUND
-
-    def streaming(self, t_ns: int) -> bool:
-        """A setpoint stream of at least 2 Hz has run for half a second."""
-        last = self._last_setpoint_ns
-        return last is not None and t_ns - last <= STREAM_GAP_NS and t_ns - self._stream_start_ns >= STREAM_NS
 
     def hold(self, p_enu: Vec3) -> None:
         """Enter Hold at ``p_enu``."""
@@ -236,10 +225,6 @@ class Autopilot:
 
     # --- watching
 
-    def _setpoint_lost(self, t_ns: int) -> bool:
-        last = self._last_setpoint_ns
-        return last is None or t_ns - last > self.parameters["COM_OF_LOSS_T"] * NS_PER_S
-
     def _lose_offboard(self, state: BodyState) -> Reply:
         if self.parameters["COM_OBL_RC_ACT"] == 4:
             self._descend(state)
@@ -298,15 +283,6 @@ class Autopilot:
             self._hover_since_ns = None
         elif self._hover_since_ns is None:
             self._hover_since_ns = t_ns
-
-    def _acceleration(self, setpoint: LocalSetpoint, state: BodyState) -> Vec3:
-        """a, or with a velocity setpoint a + k (v_sp - v), k = MPC_XY_VEL_P_ACC."""
-        ax, ay, az = setpoint.a_enu
-        if setpoint.type_mask & VELOCITY_IGNORED:
-            return setpoint.a_enu
-        k = self.parameters["MPC_XY_VEL_P_ACC"]
-        (sx, sy, sz), (vx, vy, vz) = setpoint.v_enu, state.v_enu
-        return (ax + k * (sx - vx), ay + k * (sy - vy), az + k * (sz - vz))
 
 
 def _takeoff_to_default(command: Command) -> Command:
