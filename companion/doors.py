@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 
 import msgspec
@@ -19,8 +18,6 @@ from companion.route import Route
 from companion.session import VehicleSession
 from companion.state import State
 from companion.types import VehicleState, frozen
-
-log = logging.getLogger("companion")
 
 
 class Doors:
@@ -64,7 +61,7 @@ class Doors:
             health=self._health_json,
             on_marker=self._marker if lockstep else None,
             on_vehicle=self._vehicle if by_zenoh else None,
-            on_rejected=lambda key, error: log.warning("%s: %s", key, error),
+            on_rejected=self._inbox.reject,
         )
 
     def target(self, command: wire.TargetCommand) -> wire.Reply:
@@ -100,7 +97,7 @@ class Doors:
         try:
             vehicle = wire.vehicle_from_payload(wire.decode(payload, wire.VehicleStateIn, encoding))
         except FrameRejected as error:
-            log.warning("vehicle/state: %s", error)
+            self._inbox.reject("vehicle/state", error)
             return
         self._on_vehicle(vehicle)
 

@@ -17,14 +17,20 @@ class TickMeter:
         self.ticks = 0
         self._latencies_ms: deque[float] = deque(maxlen=WINDOW)
         self.verdicts: Counter[str] = Counter()
-        self.deadline_misses = 0  # answered after the next state was due
+        self.deadline_misses = 0  # ticks whose work outlasted the period, and states skipped
         self.states_skipped = 0  # overtaken in the mailbox by a newer one
 
-    def tick(self, latency_ms: float, verdict: str) -> None:
+    def skip(self) -> None:
+        """A vehicle state was overtaken by a newer one before it was answered: its deadline was missed."""
+        self.states_skipped += 1
+        self.deadline_misses += 1
+
+    def tick(self, latency_ms: float, busy_ms: float, verdict: str) -> None:
+        """One tick: state received to setpoint sent, and to the end of all its work."""
         self.ticks += 1
         self._latencies_ms.append(latency_ms)
         self.verdicts[verdict] += 1
-        if latency_ms > self._period_ms:
+        if busy_ms > self._period_ms:
             self.deadline_misses += 1
 
     def quantiles_ms(self, last: int | None = None) -> dict[str, float]:

@@ -125,7 +125,8 @@ class Pilot:
         p_act, v_act = self._at_action(vehicle)
         u_ref, valid = self._reference(inputs, p_act, v_act)
         flying = inputs.task is not Task.STAY
-        disturbance = self._observer.update(vehicle.v_enu, elapsed_s, adapt=flying and sent)
+        estimate = self._observer.update(vehicle.v_enu, elapsed_s, adapt=sent and inputs.task is Task.FLY)
+        disturbance = estimate if flying else _ZERO
         result = self._filtered(vehicle, p_act, v_act, u_ref, prediction, flying, elapsed_s)
         wire = frozen(result.a_safe - disturbance)
         self._commands.append((prediction.start_ns, result.a_safe if sent else _ZERO))

@@ -20,6 +20,7 @@ from companion.types import NS_PER_S, DetectionFrame, TrackTable, Vec3, VehicleS
 log = logging.getLogger("companion")
 
 STATUS_NS = NS_PER_S // 5
+FLUSH_NS = NS_PER_S
 
 
 class Publisher:
@@ -31,6 +32,7 @@ class Publisher:
         self._hash = FlightHash()
         self._verdict = "silent"
         self._tracks = 0
+        self._flushed_ns = 0
         self._last: tuple[int, object] | None = None
 
     @property
@@ -70,6 +72,15 @@ class Publisher:
             self._zenoh.put_encoded(key, payload)
         if self._recorder is not None:
             self._recorder.message(f"/{key}", stamp_ns, payload)
+
+    def keep_log(self, now_ns: int) -> str | None:
+        """Flush the log once a second; why it is not written any more, or None."""
+        if self._recorder is None:
+            return None
+        if now_ns - self._flushed_ns >= FLUSH_NS:
+            self._flushed_ns = now_ns
+            self._recorder.flush()
+        return self._recorder.failure
 
     def status(
         self,

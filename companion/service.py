@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import gc
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,30 +21,28 @@ from companion.link import mav
 from companion.link.events import TimesyncReply, TimesyncRequest
 from companion.link.inbox import ObstacleInbox
 from companion.link.mavlink import MavlinkCodec, packet_count
-from companion.link.timesync import TimeSync
 from companion.link.transports import Transport, open_transport
 from companion.link.zenoh import ZenohLink
 from companion.metrics import TickMeter
-from companion.pilot import Pilot, PilotInput, PilotOutput, Task
+from companion.pilot import Pilot, PilotOutput
 from companion.publisher import Publisher
 from companion.record import Recorder
 from companion.report import setpoint_record
 from companion.route import Route
 from companion.session import VehicleSession
 from companion.state import FLYING, State
-from companion.types import NS_PER_S, DetectionFrame, VehicleState
+from companion.thinker import Thinker
+from companion.timebase import TimeBase
+from companion.types import NS_PER_S, VehicleState
 
 log = logging.getLogger("companion")
 
 HEARTBEAT_NS = NS_PER_S
-STATUS_NS = NS_PER_S // 5
-TIMESYNC_NS = NS_PER_S
-TIMESYNC_SETTLING_NS = NS_PER_S // 10
+GONE_NS = 5 * NS_PER_S  # lockstep: not even a heartbeat of the simulator
 STALL_NS = NS_PER_S  # lockstep: no progress for this much wall time ends the run
 WAKE_S = 0.2  # of wall time: heartbeats, timeouts and the stall guard need no telemetry
 RELEASE_NS = 6 * NS_PER_S // 10  # on shutdown in flight the autopilot is given this long to show its hold mode
 
-_TASKS = {State.ACTIVE: Task.FLY, State.HOLD: Task.HOLD}
 _SYSTEM_STATUS = {
     State.WAITING: mav.STATE_BOOT,
     State.READY: mav.STATE_STANDBY,
@@ -69,15 +66,6 @@ class Summary:
     log_hash: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Ahead:
-    """A tick's frames, taken before its vehicle state was there."""
-
-    tick_ns: int
-    frames: tuple[DetectionFrame, ...]
-    spent_ns: int
-
-
 class Service:
     """One vehicle, one brain. ``run`` returns after ``stop``, and raises whatever else ended it."""
 
@@ -85,7 +73,6 @@ class Service:
         self._config = config
         self._clock = clock
         self._lockstep = config.sync == "lockstep"
-        self._pilot = Pilot(config) if pilot is None else pilot
         self._codec = MavlinkCodec(system=config.mavlink.system_id or 1)
         self._route = Route(config.target, config.limits)
         self._session = VehicleSession(config, self._codec, self._route.set_position)
@@ -95,7 +82,8 @@ class Service:
             sources=(*config.lockstep_sources, *config.obstacles.required),
             on_report=log.warning,
         )
-        self._timesync = TimeSync()
+        self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
+        self._time = TimeBase(clock, self._codec, self._send, self._on_reboot)
         self._meter = TickMeter(1.0 / config.rate_hz)
         self._publisher: Publisher
         self._doors = Doors(
@@ -113,12 +101,10 @@ class Service:
         self._pending: VehicleState | None = None  # the newest state, not yet answered
         self._arrived_ns = 0  # its arrival, for the latency figure
         self._pending_since_ns = 0
-        self._ahead: _Ahead | None = None
         self._vehicle_ns = 0  # vehicle time of the newest state
-        self._silent_since: dict[str, int] = {}
-        self._policy_valid = True
+        self._heard_wall_ns: int | None = None  # any bytes from the vehicle's link
+        self._log_failed = False
         self._last_beat: tuple[int, int] | None = None
-        self._last_timesync_ns: int | None = None
         self._transport: Transport
 
     def stop(self) -> None:
@@ -155,10 +141,22 @@ class Service:
         try:
             async with asyncio.TaskGroup() as group:
                 waker = group.create_task(self._keep_waking())
-                await self._control()
+                try:
+                    await self._control()
+                except Exception:
+                    self._give_up()
+                    raise
                 waker.cancel()
         except* CompanionError as errors:
             raise errors.exceptions[0] from None
+
+    def _give_up(self) -> None:
+        """The shell itself failed: the last thing the vehicle hears is a request for its hold mode."""
+        now_ns = self._now_ns()
+        self._session.fail("the daemon failed", now_ns)
+        self._session.poll(now_ns)
+        self._flush()
+        self._transport.send(self._codec.encode_heartbeat(mav.STATE_CRITICAL))
 
     # the control task
 
@@ -178,7 +176,8 @@ class Service:
                 vehicle, self._pending = self._pending, None
                 self._tick(vehicle)
             elif self._pending is None and self._lockstep:
-                self._observe_ahead()
+                self._thinker.observe_ahead(self._vehicle_ns, self._now_ns())
+                self._check_simulator()
             self._housekeeping()
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
@@ -203,79 +202,40 @@ class Service:
             raise LockstepStalled(f"lockstep: no progress for 1 s at tick {vehicle.stamp_ns}: missing {missing}")
         return False
 
-    def _observe_ahead(self) -> None:
-        """In lockstep: the next tick's obstacles may be here before its vehicle state; track them meanwhile."""
-        tick_ns = self._inbox.complete_through_ns(self._config.lockstep_sources)
-        prepared_ns = -1 if self._ahead is None else self._ahead.tick_ns
-        if tick_ns is None or tick_ns <= max(self._vehicle_ns, prepared_ns) or self._faulty:
-            return
-        began_ns = stopwatch_ns()
-        frames = self._inbox.drain(tick_ns)
-        with self._fault_on_error():
-            self._pilot.observe(frames, tick_ns)
-        self._ahead = _Ahead(tick_ns, frames, stopwatch_ns() - began_ns)
+    def _check_simulator(self) -> None:
+        """In lockstep: a simulator that holds time still sends heartbeats; one that is gone sends nothing."""
+        heard_ns = self._heard_wall_ns
+        if heard_ns is not None and self._clock.monotonic_ns() - heard_ns > GONE_NS:
+            raise LockstepStalled(
+                f"lockstep: nothing from the vehicle for {GONE_NS / 1e9:g} s after {self._vehicle_ns} ns"
+            )
 
     def _tick(self, vehicle: VehicleState) -> None:
         """One vehicle state in, one record out, and a setpoint where the state of the daemon sends one."""
-        started_ns = stopwatch_ns()
-        session = self._session
-        session.poll(self._now_ns())
-        frames, ahead_ns = self._take_frames(vehicle.stamp_ns)
-        session.degraded(self._degradation(vehicle.stamp_ns))
+        started_ns, now_ns, session = stopwatch_ns(), self._now_ns(), self._session
+        session.poll(now_ns)
+        taken = self._thinker.take_frames(vehicle.stamp_ns, self._time.unix_minus_vehicle_ns)
         self._route.advance(vehicle.p_enu)
-        output = self._think(vehicle, frames)
+        output = self._thinker.think(vehicle, taken.frames, self._route.current, now_ns)
         thought_ns = stopwatch_ns()
-        sent = output is not None and session.streams
+        sent = False
+        if output is not None and session.streams:
+            with self._thinker.fault_on_error(now_ns):
+                self._send_setpoint(vehicle, output)
+                sent = True
         messages = self._flush()
-        if output is not None and sent:
-            self._send_setpoint(vehicle, output)
         sent_ns = stopwatch_ns()
         timings_ms = {
             "queue": (started_ns - self._arrived_ns) / 1e6,
-            "ahead": ahead_ns / 1e6,  # spent on this tick before its state arrived, lockstep only
+            "ahead": taken.ahead_ns / 1e6,  # spent on this tick before its state arrived, lockstep only
             "brain": (thought_ns - started_ns) / 1e6,
-            "total": (sent_ns - self._arrived_ns + ahead_ns) / 1e6,
+            "total": (sent_ns - self._arrived_ns + taken.ahead_ns) / 1e6,
         }
-        record = setpoint_record(
-            vehicle.stamp_ns, session.situation.state, output, sent=sent, messages=messages, timings_ms=timings_ms
-        )
-        self._publisher.tick(record, session.situation.state, vehicle, frames, output, self._pilot.tracks)
-        self._meter.tick(timings_ms["total"], record.verdict)
-
-    def _take_frames(self, tick_ns: int) -> tuple[tuple[DetectionFrame, ...], int]:
-        """The frames of this tick, and the time that was spent on them before its state arrived [ns]."""
-        ahead, self._ahead = self._ahead, None
-        if ahead is not None and ahead.tick_ns == tick_ns:
-            return ahead.frames, ahead.spent_ns
-        return self._inbox.drain(tick_ns, unix_minus_vehicle_ns=self._timesync.unix_minus_vehicle_ns), 0
-
-    def _think(self, vehicle: VehicleState, frames: tuple[DetectionFrame, ...]) -> PilotOutput | None:
-        """The brain's answer, None in FAULT."""
-        situation = self._session.situation
-        if self._faulty:
-            return None
-        task = _TASKS.get(situation.state, Task.STAY)
-        inputs = PilotInput(vehicle=vehicle, frames=frames, task=task, target_enu=self._route.current)
-        output = None
-        with self._fault_on_error():
-            output = self._pilot.step(inputs, sent=self._session.streams and situation.external)
-            self._policy_valid = output.policy_valid
-        return output
-
-    @property
-    def _faulty(self) -> bool:
-        return self._session.situation.state is State.FAULT
-
-    @contextlib.contextmanager
-    def _fault_on_error(self) -> Iterator[None]:
-        """Whatever is wrong with the brain, the answer is FAULT."""
-        try:
-            yield
-        except Exception as error:
-            log.exception("the brain failed")
-            self._session.fail(f"brain failed: {type(error).__name__}: {error}")
-            self._pilot.reset()
-            self._session.poll(self._now_ns())
+        state = session.situation.state
+        record = setpoint_record(vehicle.stamp_ns, state, output, sent=sent, messages=messages, timings_ms=timings_ms)
+        self._publisher.tick(record, state, vehicle, taken.frames, output, self._thinker.tracks)
+        busy_ms = (stopwatch_ns() - started_ns) / 1e6
+        self._meter.tick(timings_ms["total"], busy_ms, record.verdict)
 
     def _send_setpoint(self, vehicle: VehicleState, output: PilotOutput) -> None:
         self._transport.send(
@@ -283,15 +243,6 @@ class Service:
                 vehicle.stamp_ns // 1_000_000, output.wire, self._config.profile.type_mask, v_enu=vehicle.v_enu
             )
         )
-
-    def _degradation(self, stamp_ns: int) -> str | None:
-        """Why only holding is safe now, or None."""
-        for source in self._config.obstacles.required:
-            heard_ns = self._inbox.newest_stamp_ns(source)
-            since_ns = self._silent_since.setdefault(source, stamp_ns) if heard_ns is None else heard_ns
-            if stamp_ns - since_ns > self._config.obstacles.silent_s * NS_PER_S:
-                return f"obstacle source {source} silent"
-        return None if self._policy_valid else "policy output invalid"
 
     # housekeeping
 
@@ -304,10 +255,7 @@ class Service:
         now_ns, wall_ns = self._now_ns(), self._clock.monotonic_ns()
         if not self._lockstep:
             self._session.poll(now_ns)
-            every_ns = TIMESYNC_NS if self._timesync.settled else TIMESYNC_SETTLING_NS
-            if self._last_timesync_ns is None or wall_ns - self._last_timesync_ns >= every_ns:
-                self._last_timesync_ns = wall_ns
-                self._transport.send(self._codec.encode_timesync_request(self._timesync.request(wall_ns)))
+            self._time.poll()
         state = self._session.situation.state
         last = self._last_beat
         if last is None or now_ns - last[0] >= HEARTBEAT_NS or wall_ns - last[1] >= HEARTBEAT_NS:
@@ -315,6 +263,18 @@ class Service:
             self._transport.send(self._codec.encode_heartbeat(_SYSTEM_STATUS.get(state, mav.STATE_ACTIVE)))
         self._flush()
         self._publish_status(now_ns)
+        self._keep_log(now_ns)
+
+    def _keep_log(self, now_ns: int) -> None:
+        """Flush the log now and then; a log that cannot be written is told once and flown without."""
+        failure = self._publisher.keep_log(now_ns)
+        if failure is not None and not self._log_failed:
+            self._log_failed = True
+            log.error("%s", failure)
+            self._session.say(mav.SEVERITY_WARNING, "companion: log lost, flying on")
+
+    def _send(self, data: bytes) -> None:
+        self._transport.send(data)
 
     def _flush(self) -> int:
         """Send what the session has to say; the number of MAVLink packets."""
@@ -361,41 +321,43 @@ class Service:
     # what the links hand in
 
     def _on_bytes(self, data: bytes) -> None:
+        self._heard_wall_ns = self._clock.monotonic_ns()
         for event in self._codec.receive(data):
             if isinstance(event, TimesyncRequest | TimesyncReply):
-                self._on_timesync(event)
+                self._time.handle(event, self._session.system)
             elif (vehicle := self._session.handle(event, self._now_ns())) is not None:
                 self._on_vehicle(vehicle)
         self._flush()
 
     def _on_vehicle(self, vehicle: VehicleState) -> None:
         """A new vehicle state; only the newest waits for the control task."""
-        if self._timesync.vehicle_time(vehicle.stamp_ns):
-            log.warning("the autopilot rebooted: tracks and clock offset start anew")
-            self._inbox.reset()
-            self._pilot.reset()
-        elif self._pending is not None:
-            self._meter.states_skipped += 1
-            if vehicle.stamp_ns <= self._pending.stamp_ns:
-                return
-        elif 0 < vehicle.stamp_ns <= self._vehicle_ns:
+        if self._time.rebooted(vehicle.stamp_ns):
+            self._on_reboot()
+        if self._is_stale(vehicle.stamp_ns):
+            self._meter.skip()
+            return
+        if self._pending is not None:
+            self._meter.skip()
+        if 0 < vehicle.stamp_ns <= self._vehicle_ns:
             return  # reordered or repeated by the link
         self._pending = vehicle
         self._vehicle_ns = vehicle.stamp_ns
         self._arrived_ns = stopwatch_ns()
         self._pending_since_ns = self._clock.monotonic_ns()
-        self._session.heard_vehicle(vehicle, self._now_ns())
+        self._session.heard_vehicle(self._now_ns())
         self._wake.set()
 
-    def _on_timesync(self, event: TimesyncRequest | TimesyncReply) -> None:
-        now_ns = self._clock.monotonic_ns()
-        if isinstance(event, TimesyncReply):
-            if event.system == self._session.system and event.component == mav.AUTOPILOT_COMPONENT:
-                self._timesync.reply(
-                    tc1_ns=event.tc1_ns, ts1_ns=event.ts1_ns, now_ns=now_ns, unix_ns=self._clock.unix_ns()
-                )
-        elif self._timesync.settled:
-            self._transport.send(self._codec.encode_timesync_reply(tc1_ns=now_ns, ts1_ns=event.ts1_ns))
+    def _is_stale(self, stamp_ns: int) -> bool:
+        """Whether a state lay about before it was read: what it says is not where the vehicle is."""
+        age_ns = None if self._lockstep else self._time.age_ns(stamp_ns)
+        return age_ns is not None and age_ns > self._config.vehicle.stale_s * NS_PER_S
+
+    def _on_reboot(self) -> None:
+        log.warning("the autopilot rebooted: tracks, queues and clock offset start anew")
+        self._pending = None
+        self._vehicle_ns = 0
+        self._thinker.reset()
+        self._session.rebooted()
 
     def _on_change(self) -> None:
         """A command or a marker came by Zenoh: answer the autopilot and look again."""

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from companion.config import Config
+from companion.latch import AutopilotLatch
 from companion.link import mav
 from companion.link.decode import CommandRefused, reposition_target
 from companion.link.events import Attitude, Command, Heartbeat, LandedState, Position
@@ -19,9 +20,9 @@ from companion.profiles import ModeRequest
 from companion.state import FLYING, Event, Situation, State, advance, refusal
 from companion.types import NS_PER_S, Vec3, VehicleState
 
-LATCH_NS = 3 * NS_PER_S  # exactly one autopilot heard for this long is ours
 REPEAT_NS = NS_PER_S // 2  # mode requests
 INTERVAL_RETRY_NS = 2 * NS_PER_S
+FAULT_RETRY_NS = 5 * NS_PER_S  # on the ground the brain may try again, this often
 EXTENDED_SYS_STATE_HZ = 2.0
 
 _SEVERITY = {
@@ -46,15 +47,19 @@ class VehicleSession:
         self.situation = Situation()
         self.armed = False
         self.custom_mode: int | None = None
-        self._stamp_ns = 0  # of the newest vehicle state
         self._attitude: Attitude | None = None
         self._system: int | None = None
-        self._candidates: dict[int, int] = {}  # system -> first heard
+        self._component: int | None = None
+        self._latch = AutopilotLatch(config.mavlink.system_id)
         self._heartbeat_ns: int | None = None
         self._state_ns: int | None = None
         self._sequence_ns: int | None = None  # start of the engage sequence
         self._requested_ns: int | None = None  # last mode request
-        self._intervals_ns: int | None = None
+        self._asked_ns: dict[int, int] = {}  # message -> last asked for
+        self._heard_ns: dict[int, int] = {}  # message -> last arrived
+        self._asked_external_ns: int | None = None
+        self._hold_wanted = False  # a fault in flight, or an external mode that came after a release
+        self._failed_ns = 0
         self._told: tuple[State, str] | None = None
         self._outgoing: list[bytes] = []
 
@@ -83,6 +88,9 @@ class VehicleSession:
         if why is None:
             self._event(Event.ENGAGE)
             self._sequence_ns = None
+            self._hold_wanted = False
+            if not self.situation.airborne:
+                self.situation = replace(self.situation, reason="engaged, waiting to be airborne")
         return why
 
     def release(self, now_ns: int) -> None:
@@ -95,10 +103,22 @@ class VehicleSession:
         if (reason is not None) != self.situation.degraded:
             self._event(Event.RECOVERED if reason is None else Event.DEGRADED, reason or "")
 
-    def fail(self, reason: str) -> None:
-        """The brain could not answer."""
+    def fail(self, reason: str, now_ns: int) -> None:
+        """The brain could not answer. Only a vehicle that we were flying is put into its hold mode, and once."""
+        self._hold_wanted = self._hold_wanted or self.situation.state in FLYING
         self._event(Event.BRAIN_FAILED, reason)
         self._requested_ns = None
+        self._failed_ns = now_ns
+
+    def say(self, severity: int, text: str) -> None:
+        """A STATUSTEXT for the operator."""
+        self._outgoing.append(self._codec.encode_statustext(severity, text))
+
+    def rebooted(self) -> None:
+        """The autopilot began anew: it forgot which messages it was asked for."""
+        self._asked_ns.clear()
+        self._heard_ns.clear()
+        self._attitude = None
 
     # what comes in
 
@@ -107,11 +127,14 @@ class VehicleSession:
         match event:
             case Heartbeat():
                 self._on_heartbeat(event, now_ns)
-            case Attitude() if self._is_ours(event.system):
+            case Attitude() if self._by_mavlink and self._is_ours(event):
+                self._heard_ns[mav.MSG_ATTITUDE_QUATERNION] = now_ns
                 self._attitude = event
-            case Position() if self._is_ours(event.system):
+            case Position() if self._by_mavlink and self._is_ours(event):
+                self._heard_ns[mav.MSG_LOCAL_POSITION_NED] = now_ns
                 return self._on_position(event)
-            case LandedState() if self._is_ours(event.system):
+            case LandedState() if self._is_ours(event):
+                self._heard_ns[mav.MSG_EXTENDED_SYS_STATE] = now_ns
                 self._on_landed(event)
             case Command():
                 self._on_command(event, now_ns)
@@ -119,16 +142,14 @@ class VehicleSession:
                 pass
         return None
 
-    def heard_vehicle(self, vehicle: VehicleState, now_ns: int) -> None:
+    def heard_vehicle(self, now_ns: int) -> None:
         """A vehicle state arrived, from MAVLink or Zenoh."""
-        if vehicle.stamp_ns < self._stamp_ns - NS_PER_S:
-            self._intervals_ns = None  # the boot clock went back: a reboot forgets message intervals
-        self._stamp_ns = vehicle.stamp_ns
         self._state_ns = now_ns
 
     def poll(self, now_ns: int) -> None:
         """Time passes: freshness, latching, the engage, release and fault sequences, message intervals, STATUSTEXT."""
-        self._latch(now_ns)
+        if self._system is None:
+            self._choose(now_ns)
         fresh = self._is_fresh(now_ns)
         if fresh != self.situation.fresh:
             self._event(Event.VEHICLE_FRESH if fresh else Event.VEHICLE_LOST, self._lost_reason(now_ns))
@@ -141,8 +162,13 @@ class VehicleSession:
 
     # details
 
-    def _is_ours(self, system: int) -> bool:
-        return self._config.vehicle.source == "mavlink" and system == self._system
+    @property
+    def _by_mavlink(self) -> bool:
+        return self._config.vehicle.source == "mavlink"
+
+    def _is_ours(self, event: Attitude | Position | LandedState | Heartbeat) -> bool:
+        """From the autopilot that was latched: other components of its system speak for themselves."""
+        return (event.system, event.component) == (self._system, self._component)
 
     def _event(self, event: Event, detail: str = "") -> None:
         self.situation = advance(self.situation, event, engage_by=self._config.engage_by, detail=detail)
@@ -150,34 +176,40 @@ class VehicleSession:
     def _on_heartbeat(self, beat: Heartbeat, now_ns: int) -> None:
         if beat.autopilot == mav.AUTOPILOT_INVALID:
             return
-        wanted = self._config.mavlink.system_id
         if self._system is None:
-            self._candidates.setdefault(beat.system, now_ns)
-            if wanted is not None and beat.system == wanted:
-                self._take_system(wanted)
-        if beat.system != self._system:
+            self._latch.heard(beat, now_ns)
+            self._choose(now_ns)
+        if not self._is_ours(beat):
             return
         if self._heartbeat_ns is not None and now_ns - self._heartbeat_ns > self._timeout_ns:
-            self._intervals_ns = None  # it may have rebooted: message intervals are lost then
+            self.rebooted()  # it may have: asking again does no harm
         self._heartbeat_ns = now_ns
-        external = beat.custom_mode == self._profile.external.custom_mode
         self.custom_mode = beat.custom_mode
-        if self.armed and not beat.armed:
+        grounded_fault = self.situation.state is State.FAULT and now_ns - self._failed_ns >= FAULT_RETRY_NS
+        if not beat.armed and (self.armed or grounded_fault):
             self._event(Event.DISARMED)
         self.armed = beat.armed
-        if external != self.situation.external:
+        self._on_mode(beat.custom_mode == self._profile.external.custom_mode, now_ns)
+
+    def _on_mode(self, external: bool, now_ns: int) -> None:
+        if not external:
+            self._hold_wanted = False
+        if external == self.situation.external:
+            return
+        asked_ns = self._asked_external_ns
+        ours = asked_ns is not None and now_ns - asked_ns <= self._config.engage.timeout_s * NS_PER_S
+        if external and ours and not self.situation.engaged:
+            # released while the mode was on its way: it is nobody's switch, and not wanted any more
+            self.situation = advance(self.situation, Event.EXTERNAL_ON, engage_by="command")
+            self._hold_wanted = True
+        else:
             self._event(Event.EXTERNAL_ON if external else Event.EXTERNAL_OFF)
 
-    def _take_system(self, system: int) -> None:
-        self._system = system
-        self._codec.system = system
-
-    def _latch(self, now_ns: int) -> None:
-        if self._system is not None or self._config.mavlink.system_id is not None or len(self._candidates) != 1:
-            return
-        [(system, first_ns)] = self._candidates.items()
-        if now_ns - first_ns >= LATCH_NS:
-            self._take_system(system)
+    def _choose(self, now_ns: int) -> None:
+        chosen = self._latch.choose(now_ns)
+        if chosen is not None:
+            self._system, self._component = chosen
+            self._codec.system = self._system
 
     def _on_position(self, position: Position) -> VehicleState | None:
         if self._attitude is None:
@@ -222,8 +254,8 @@ class VehicleSession:
 
     def _lost_reason(self, now_ns: int) -> str:
         """Why there is no fresh vehicle; without numbers that change, so that it is told once."""
-        if self._system is None and len(self._candidates) > 1:
-            return f"autopilots {sorted(self._candidates)} heard, set mavlink.system_id"
+        if self._system is None and self._config.mavlink.system_id is None and len(self._latch.systems) > 1:
+            return f"autopilots {self._latch.systems} heard, set mavlink.system_id"
         if self._heartbeat_ns is None:
             return "no heartbeat"
         if now_ns - self._heartbeat_ns > self._timeout_ns:
@@ -241,14 +273,14 @@ class VehicleSession:
         since_s = (now_ns - self._sequence_ns) / NS_PER_S
         if since_s >= self._config.engage.stream_s + self._config.engage.timeout_s:
             self._event(Event.ENGAGE_TIMEOUT)
-            self._status(mav.SEVERITY_WARNING, "engage: autopilot did not enter its external mode")
+            self.say(mav.SEVERITY_WARNING, "engage: autopilot did not enter its external mode")
         elif since_s >= self._config.engage.stream_s:
+            self._asked_external_ns = now_ns
             self._request(self._profile.external, now_ns)
 
     def _run_requests(self, now_ns: int) -> None:
-        """A release, or a fault while the autopilot still obeys us, asks for the hold mode until it is seen."""
-        s = self.situation
-        if s.releasing or (s.state is State.FAULT and s.external):
+        """A release, or a fault in flight, asks for the hold mode until it is seen; what a pilot does then stands."""
+        if self.situation.releasing or self._hold_wanted:
             self._request(self._profile.hold, now_ns)
 
     def _request(self, mode: ModeRequest, now_ns: int) -> None:
@@ -259,19 +291,19 @@ class VehicleSession:
             self._outgoing.append(self._codec.encode_set_mode(mode))
 
     def _ask_intervals(self, now_ns: int) -> None:
-        if self._system is None or self._config.vehicle.source != "mavlink":
+        """SET_MESSAGE_INTERVAL for what does not arrive, until it does."""
+        if self._system is None:
             return
-        answered = self._intervals_ns is not None and self.situation.fresh
-        if answered or (self._intervals_ns is not None and now_ns - self._intervals_ns < INTERVAL_RETRY_NS):
-            return
-        self._intervals_ns = now_ns
         rate_hz = float(self._config.rate_hz)
-        for message, hz in (
-            (mav.MSG_LOCAL_POSITION_NED, rate_hz),
-            (mav.MSG_ATTITUDE_QUATERNION, rate_hz),
-            (mav.MSG_EXTENDED_SYS_STATE, EXTENDED_SYS_STATE_HZ),
-        ):
-            self._outgoing.append(self._codec.encode_set_message_interval(message, hz))
+        wanted = {mav.MSG_EXTENDED_SYS_STATE: EXTENDED_SYS_STATE_HZ}
+        if self._by_mavlink:
+            wanted |= {mav.MSG_LOCAL_POSITION_NED: rate_hz, mav.MSG_ATTITUDE_QUATERNION: rate_hz}
+        for message, hz in wanted.items():
+            asked_ns, heard_ns = self._asked_ns.get(message), self._heard_ns.get(message)
+            arriving = heard_ns is not None and now_ns - heard_ns < INTERVAL_RETRY_NS
+            if asked_ns is None or (not arriving and now_ns - asked_ns >= INTERVAL_RETRY_NS):
+                self._asked_ns[message] = now_ns
+                self._outgoing.append(self._codec.encode_set_message_interval(message, hz))
 
     def _tell(self) -> None:
         """STATUSTEXT when state or reason changed, once each."""
@@ -279,7 +311,4 @@ class VehicleSession:
         if now != self._told:
             self._told = now
             state, reason = now
-            self._status(_SEVERITY.get(state, mav.SEVERITY_INFO), f"companion {state.value}: {reason}")
-
-    def _status(self, severity: int, text: str) -> None:
-        self._outgoing.append(self._codec.encode_statustext(severity, text))
+            self.say(_SEVERITY.get(state, mav.SEVERITY_INFO), f"companion {state.value}: {reason}")

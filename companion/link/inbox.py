@@ -64,12 +64,12 @@ class ObstacleInbox:
         """One frame as it arrived; never raises."""
         entry = self._source(source)
         if entry is None:
-            self._reject(source, FrameRejected("too_many_sources", f"expected at most {MAX_SOURCES} sources"))
+            self.reject(source, FrameRejected("too_many_sources", f"expected at most {MAX_SOURCES} sources"))
             return
         sequence, entry.arrived = entry.arrived, entry.arrived + 1
         if len(payload) > MAX_PAYLOAD_BYTES:
             detail = f"expected at most {MAX_PAYLOAD_BYTES} bytes, got {len(payload)}"
-            self._reject(source, FrameRejected("too_large", detail))
+            self.reject(source, FrameRejected("too_large", detail))
             return
         if len(entry.queue) >= self._queue:
             entry.queue.popleft()
@@ -80,16 +80,16 @@ class ObstacleInbox:
         """One lockstep marker as it arrived; never raises. A marker that does not advance is rejected."""
         entry = self._source(source)
         if entry is None:
-            self._reject(source, FrameRejected("too_many_sources", f"expected at most {MAX_SOURCES} sources"))
+            self.reject(source, FrameRejected("too_many_sources", f"expected at most {MAX_SOURCES} sources"))
             return
         try:
             marker = wire.decode(payload, wire.SyncMarker, encoding)
         except FrameRejected as error:
-            self._reject(source, error)
+            self.reject(source, error)
             return
         if entry.through_ns is not None and marker.through_ns <= entry.through_ns:
             detail = f"through_ns: expected above {entry.through_ns}, got {marker.through_ns}"
-            self._reject(source, FrameRejected("marker_order", detail))
+            self.reject(source, FrameRejected("marker_order", detail))
             return
         entry.through_ns = marker.through_ns
         entry.before, entry.announced = entry.announced, entry.announced + marker.frames
@@ -141,7 +141,7 @@ class ObstacleInbox:
                         max_age_s=self._max_age_s,
                     )
                 except FrameRejected as error:
-                    self._reject(name, error)
+                    self.reject(name, error)
                     continue
                 self.counts["frames"] += 1
                 entry.newest_stamp_ns = max(frame.stamp_ns, entry.newest_stamp_ns or frame.stamp_ns)
@@ -177,7 +177,8 @@ class ObstacleInbox:
             return float("inf")
         return entry.announced if entry.through_ns <= tick_ns else entry.before
 
-    def _reject(self, source: str, error: FrameRejected) -> None:
+    def reject(self, source: str, error: FrameRejected) -> None:
+        """Count what was refused at a door, for the next report."""
         self.counts[error.reason] += 1
         self._unreported += 1
         self._last_rejection = f"{source}: {error}"
@@ -188,6 +189,6 @@ class ObstacleInbox:
         last_ns = self._reported_ns
         if last_ns is not None and 0 <= now_ns - last_ns < NS_PER_S:
             return
-        self._on_report(f"rejected {self._unreported} obstacle frames, the last of {self._last_rejection}")
+        self._on_report(f"rejected {self._unreported} payloads, the last of {self._last_rejection}")
         self._unreported = 0
         self._reported_ns = now_ns

@@ -21,7 +21,14 @@ LAYERS = [
     {"companion.pilot"},
     {"companion.state"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
-    {"companion.session", "companion.thinker", "companion.publisher", "companion.doors"},
+    {
+        "companion.latch",
+        "companion.session",
+        "companion.timebase",
+        "companion.thinker",
+        "companion.publisher",
+        "companion.doors",
+    },
     {"companion.service", "companion.publish", "companion.demo"},
     {"companion.cli"},
 ]

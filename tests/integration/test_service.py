@@ -7,8 +7,10 @@ import contextlib
 import json
 import socket
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import zenoh
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -31,6 +33,7 @@ class Failing:
     def __init__(self, config: Any) -> None:
         self._pilot = Pilot(config)
         self.fails = False
+        self.answers_nan = False
         self.resets = 0
 
     def reset(self) -> None:
@@ -40,10 +43,14 @@ class Failing:
     def tracks(self) -> Any:
         return self._pilot.tracks()
 
+    def observe(self, frames: Any, stamp_ns: int) -> None:
+        self._pilot.observe(frames, stamp_ns)
+
     def step(self, inputs: Any, *, sent: bool) -> Any:
         if self.fails:
             raise ZeroDivisionError("on purpose")
-        return self._pilot.step(inputs, sent=sent)
+        output = self._pilot.step(inputs, sent=sent)
+        return replace(output, wire=np.full(3, np.nan)) if self.answers_nan else output
 
 
 class Autopilot:
@@ -57,6 +64,7 @@ class Autopilot:
         self._mav = dialect.MAVLink(None, 1, 1)
         self.mode = HOLD
         self.tick = 0
+        self.answers_time = False
         self.received: list[Any] = []
 
     def close(self) -> None:
@@ -68,11 +76,14 @@ class Autopilot:
     def beat(self) -> None:
         self._send(self._mav.heartbeat_encode(2, 12, 1 | 128, self.mode, 4))
 
+    def landed(self, state: int) -> None:
+        self._send(self._mav.extended_sys_state_encode(0, state))
+
     async def fly(self, ticks: int = 1) -> None:
         for _ in range(ticks):
             self.tick += 1
             self.beat()
-            self._send(self._mav.extended_sys_state_encode(0, 2))
+            self.landed(2)
             self._send(self._mav.attitude_quaternion_encode(50 * self.tick, 1.0, 0, 0, 0, 0, 0, 0))
             self._send(self._mav.local_position_ned_encode(50 * self.tick, 0, 0, -2, 0, 0, 0))
             await self.listen()
@@ -83,7 +94,10 @@ class Autopilot:
             async with asyncio.timeout(0.05):
                 while True:
                     data = await loop.sock_recv(self._socket, 4096)
-                    self.received.extend(self._mav.parse_buffer(data) or [])
+                    for message in self._mav.parse_buffer(data) or []:
+                        self.received.append(message)
+                        if self.answers_time and message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                            self._send(self._mav.timesync_encode(50_000_000 * self.tick + 1, message.ts1))
 
     def command(self, number: int, param1: float) -> None:
         self._send(self._mav.command_long_encode(1, 196, number, 0, param1, 0, 0, 0, 0, 0, 0))
@@ -136,7 +150,7 @@ async def activate(autopilot: Autopilot) -> None:
 def test_a_failed_brain_means_fault_silence_and_a_request_for_hold() -> None:
     async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
         await activate(autopilot)
-        brain.fails = True
+        brain.fails, brain.resets = True, 0
         await autopilot.fly(1)
         autopilot.received.clear()
         await autopilot.fly(5)
@@ -151,6 +165,18 @@ def test_a_failed_brain_means_fault_silence_and_a_request_for_hold() -> None:
     summary = run(script)
     assert summary.final_state == "FAULT"
     assert summary.verdicts["silent"] >= 30
+
+
+def test_an_answer_that_must_not_reach_the_wire_means_fault() -> None:
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        await activate(autopilot)
+        brain.answers_nan = True
+        autopilot.received.clear()
+        await autopilot.fly(5)
+        assert autopilot.of("SET_POSITION_TARGET_LOCAL_NED") == []
+        assert (4, 3) in autopilot.mode_requests()
+
+    assert run(script).final_state == "FAULT"
 
 
 def test_a_stop_in_flight_hands_the_vehicle_back_first() -> None:
@@ -187,18 +213,71 @@ def test_the_vehicle_state_may_come_by_zenoh() -> None:
         with zenoh.open(config) as session:
             states = session.declare_publisher("uav/uav1/vehicle/state")
             stamp_ms = 0
-            while not autopilot.of("SET_POSITION_TARGET_LOCAL_NED"):
+            while service._session.situation.state.value != "ACTIVE":
                 stamp_ms += 50
                 state = {"stamp_ns": stamp_ms * 1_000_000, "frame": "local_ned"}
                 states.put(json.dumps({**state, "position": [1.0, 2.0, -3.0], "velocity": [0.0, 0.0, 0.0]}))
                 autopilot.beat()
                 await autopilot.listen()
+                if stamp_ms == 500:
+                    autopilot.landed(2)
+                    autopilot.command(92, 1.0)
+                if autopilot.mode_requests():
+                    autopilot.mode = OFFBOARD
             states.put(b"{}")  # rejected, survived
             await autopilot.listen()
         setpoint = autopilot.of("SET_POSITION_TARGET_LOCAL_NED")[0]
         assert 0 < setpoint.time_boot_ms <= stamp_ms
 
     assert run(script, zenoh={"listen": [endpoint]}, vehicle={"source": "zenoh"}).ticks > 0
+
+
+def test_a_reboot_that_shows_in_timesync_first_is_noticed() -> None:
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        autopilot.answers_time = True
+        autopilot.tick = 100_000
+        while sum(m.tc1 == 0 for m in autopilot.of("TIMESYNC")) < 8:
+            await autopilot.fly()
+        autopilot.received.clear()
+        autopilot.tick = 0  # up again: the clock began anew, TIMESYNC is answered before a position is known
+        while sum(m.tc1 == 0 for m in autopilot.of("TIMESYNC")) < 8:
+            autopilot.beat()
+            await autopilot.listen()
+        autopilot.received.clear()
+        await autopilot.fly(20)
+        assert autopilot.of("SET_POSITION_TARGET_LOCAL_NED")
+
+    assert run(script).final_state == "READY"
+
+
+def test_unix_frames_without_a_time_base_mean_hold() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        config = zenoh.Config()
+        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        with zenoh.open(config) as session:
+            frames = session.declare_publisher("uav/uav1/obstacles/lidar")
+            await activate(autopilot)
+            for _ in range(10):
+                frames.put(json.dumps({"stamp_ns": 1_700_000_000 * 10**9, "clock": "unix", "obstacles": []}))
+                await autopilot.fly()
+            assert service._session.situation.state.value == "HOLD"
+            assert "time base" in service._session.situation.reason
+            await autopilot.fly(25)  # the source stopped: nothing that cannot be placed in time any more
+            assert service._session.situation.state.value == "ACTIVE"
+
+    run(script, zenoh={"listen": [endpoint]})
+
+
+def test_lockstep_notices_a_simulator_that_is_gone() -> None:
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        for _ in range(140):
+            await autopilot.listen()
+
+    with pytest.raises(LockstepStalled, match="nothing from the vehicle"):
+        run(script, sync="lockstep", lockstep_sources=[])
 
 
 def test_lockstep_names_the_source_that_is_missing() -> None:

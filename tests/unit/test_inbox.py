@@ -86,8 +86,8 @@ def test_rejections_are_reported_at_most_once_a_second_of_vehicle_time() -> None
         inbox.push("lidar", b"nonsense")
         inbox.drain(tick * 50 * MS)
     assert len(lines) == 2
-    assert lines[0].startswith("rejected 1 obstacle frames, the last of lidar: malformed: ")
-    assert lines[1].startswith("rejected 20 obstacle frames")
+    assert lines[0].startswith("rejected 1 payloads, the last of lidar: malformed: ")
+    assert lines[1].startswith("rejected 20 payloads")
 
 
 def test_strangers_cannot_take_the_place_of_configured_sources() -> None:

@@ -47,9 +47,8 @@ class Rig:
                     self.session.handle(LandedState(system, 1, self.airborne, False, False), self.now_ns)
                     self.session.handle(Attitude(system, 1, self.now_ns, frozen([1, 0, 0, 0])), self.now_ns)
                     position = Position(system, 1, self.now_ns, frozen([0, 0, 2]), frozen([0, 0, 0]))
-                    vehicle = self.session.handle(position, self.now_ns)
-                    if vehicle is not None:
-                        self.session.heard_vehicle(vehicle, self.now_ns)
+                    if self.session.handle(position, self.now_ns) is not None:
+                        self.session.heard_vehicle(self.now_ns)
             self.session.poll(self.now_ns)
             self.collect()
 
@@ -214,7 +213,7 @@ def test_missing_heartbeats_are_noticed(rig: Rig) -> None:
 
 def test_a_failed_brain_goes_quiet_and_asks_for_hold(rig: Rig) -> None:
     engaged(rig)
-    rig.session.fail("brain failed: ValueError")
+    rig.session.fail("brain failed: ValueError", rig.now_ns)
     rig.beat(0.1)
     assert rig.state is State.FAULT
     assert not rig.session.streams
@@ -289,3 +288,98 @@ def test_ardupilot_is_silent_until_active() -> None:
     assert rig.state is State.ACTIVE
     assert rig.session.streams
     assert rig.now_ns < 10 * NS_PER_S
+
+
+def test_a_fault_asks_for_hold_only_of_a_vehicle_that_we_were_flying() -> None:
+    rig = Rig(parse_config({"vehicle": {"profile": "ardupilot"}, "mavlink": {"system_id": 1}}))
+    rig.mode = 4  # GUIDED, flown by a ground station
+    rig.beat(1.0)
+    rig.session.fail("brain failed", rig.now_ns)
+    rig.beat(3.0)
+    assert rig.state is State.FAULT
+    assert rig.mode_requests() == []
+
+
+def test_after_a_fault_the_pilot_is_not_fought(rig: Rig) -> None:
+    engaged(rig)
+    rig.session.fail("brain failed", rig.now_ns)
+    rig.mode = HOLD
+    rig.beat(0.5)
+    asked = len(rig.mode_requests())
+    rig.mode = OFFBOARD  # the pilot's own companion takes over
+    rig.beat(5.0)
+    assert len(rig.mode_requests()) == asked
+
+
+def test_a_fault_on_the_ground_is_tried_again(rig: Rig) -> None:
+    rig.armed, rig.airborne = False, False
+    rig.beat(1.0)
+    rig.session.fail("brain failed", rig.now_ns)
+    rig.beat(3.0)
+    assert rig.state is State.FAULT
+    rig.beat(3.0)
+    assert rig.state is State.READY
+
+
+def test_a_release_during_the_engage_sequence_holds() -> None:
+    rig = Rig(parse_config({"vehicle": {"profile": "px4"}, "mavlink": {"system_id": 1}}))
+    rig.beat(1.0)
+    rig.command(92, 1.0)
+    rig.beat(0.8)
+    assert rig.mode_requests()[-1] == (6, 0)
+    assert rig.command(92, 0.0) == 0
+    rig.mode = OFFBOARD  # the mode that was asked for arrives late
+    rig.beat(0.6)
+    assert rig.state is State.READY
+    assert rig.mode_requests()[-1] == (4, 3)
+    rig.mode = HOLD
+    rig.beat(10.0)
+    rig.mode = OFFBOARD  # later the pilot's own switch engages as ever
+    rig.beat(0.2)
+    assert rig.state is State.ACTIVE
+
+
+def test_other_components_of_the_system_are_not_the_autopilot(rig: Rig) -> None:
+    rig.beat(1.0)
+    odometry = Position(1, 197, rig.now_ns + 1, frozen([50, 0, 2]), frozen([0, 0, 0]))
+    assert rig.session.handle(odometry, rig.now_ns) is None
+    rig.session.handle(LandedState(1, 240, False, False, False), rig.now_ns)
+    rig.session.handle(Heartbeat(1, 42, 3, 2, OFFBOARD, False, 4), rig.now_ns)
+    assert rig.session.situation.airborne
+    assert rig.session.armed
+    assert not rig.session.situation.external
+
+
+def test_a_single_heartbeat_is_nobody_to_latch() -> None:
+    rig = Rig(parse_config({}))
+    rig.session.handle(Heartbeat(77, 1, 12, 2, HOLD, True, 4), 0)
+    rig.systems = []
+    rig.beat(5.0)
+    rig.systems = [5]
+    rig.beat(4.0)
+    assert rig.session.system == 5
+
+
+def test_messages_that_do_not_arrive_are_asked_for_again(rig: Rig) -> None:
+    for _ in range(100):
+        rig.now_ns += 100 * MS
+        rig.session.handle(Heartbeat(1, 1, 12, 2, HOLD, True, 4), rig.now_ns)
+        rig.session.handle(Attitude(1, 1, rig.now_ns, frozen([1, 0, 0, 0])), rig.now_ns)
+        rig.session.handle(Position(1, 1, rig.now_ns, frozen([0, 0, 2]), frozen([0, 0, 0])), rig.now_ns)
+        rig.session.heard_vehicle(rig.now_ns)
+        rig.session.poll(rig.now_ns)
+        rig.collect()
+    asked = [int(m.param1) for m in rig.messages("COMMAND_LONG") if m.command == 511]
+    assert asked.count(245) >= 4
+    assert asked.count(31) == asked.count(32) == 1
+    assert rig.command(92, 1.0) == 0
+    rig.session.poll(rig.now_ns)
+    assert "waiting to be airborne" in rig.session.situation.reason
+
+
+def test_a_vehicle_by_zenoh_still_asks_whether_it_flies() -> None:
+    rig = Rig(parse_config({"vehicle": {"source": "zenoh"}, "mavlink": {"system_id": 1}}))
+    rig.beat(0.5)
+    asked = [int(m.param1) for m in rig.messages("COMMAND_LONG") if m.command == 511]
+    assert asked == [245]
+    assert rig.session.situation.airborne
