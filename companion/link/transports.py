@@ -6,7 +6,8 @@
     tcpout://HOST:PORT     connect, and again after a loss
     serial:///dev/X:BAUD   a serial port, opened again after a loss
 
-Nothing is queued beyond one kernel buffer: a setpoint that cannot leave now is stale, so it is dropped and counted.
+Nothing is queued here beyond the kernel's send buffer, a few kilobytes of it on TCP: a setpoint that cannot leave now
+is stale, so it is dropped and counted. What the receive buffer of a TCP peer has taken cannot be called back.
 """
 
 from __future__ import annotations

@@ -13,7 +13,10 @@ from companion.types import NS_PER_S
 
 PEER_NS = 5 * NS_PER_S
 MAX_PEERS = 16
-_BATCH = 64  # datagrams read before other tasks get their turn
+# Read until the socket is empty before any task runs: a tick in the middle of a backlog would answer an old state.
+# The bound is above what a receive buffer holds, so only a sender faster than this reader ever meets it; without it
+# such a sender would keep the loop here for good.
+_DRAIN = 4096  # datagrams
 
 Address = tuple[Any, ...]  # (host, port) or IPv6's four
 
@@ -70,7 +73,7 @@ class UdpLink:
             self._socket.close()
 
     def _read(self) -> None:
-        for _ in range(_BATCH):
+        for _ in range(_DRAIN):
             if self._closed:
                 return
             try:

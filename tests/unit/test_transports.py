@@ -160,21 +160,36 @@ def test_tcpout_waits_for_a_peer_that_is_not_there_yet() -> None:
     run(scenario)
 
 
+def test_udp_backlog_is_read_before_any_task_runs() -> None:
+    async def scenario() -> None:
+        inbox = Inbox()
+        async with opened(f"udpin://{LOOPBACK}:0", inbox) as link:
+            with udp_socket() as sender:
+                for number in range(200):  # what waits after a pause of this process
+                    sender.sendto(b"<%d>" % number, link.local_address)
+            await inbox.until(b"<0>")  # the first task to run after the reader
+            assert inbox.data.endswith(b"<199>")
+
+    run(scenario)
+
+
 def test_tcp_drops_what_a_stalled_peer_does_not_take() -> None:
     async def scenario() -> None:
         async with opened(f"tcpin://{LOOPBACK}:0", Inbox()) as server:
-            with socket.create_connection(server.local_address) as peer:
+            with socket.socket() as peer:
+                peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)  # leaves the sender's buffers to be seen
+                peer.connect(server.local_address)
                 peer.send(b"x")
                 async with asyncio.timeout(5.0):
                     while server.counts["bytes_in"] == 0:
                         await asyncio.sleep(0)
-                packet = bytes(4096)
+                setpoint = bytes(65)
                 for _ in range(10_000):
-                    server.send(packet)
-                assert server.counts["dropped"] > 0
-                queued = server.counts["bytes_out"]
-                assert queued + server.counts["dropped"] * len(packet) == 10_000 * len(packet)
-                assert server._peer._transport.get_write_buffer_size() <= MAX_BACKLOG_BYTES + len(packet)
+                    server.send(setpoint)
+                accepted = server.counts["bytes_out"]
+                assert accepted + server.counts["dropped"] * len(setpoint) == 10_000 * len(setpoint)
+                assert accepted <= 4 * MAX_BACKLOG_BYTES
+                assert server._peer._transport.get_write_buffer_size() <= len(setpoint)
 
     run(scenario)
 
