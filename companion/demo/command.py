@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import errno
 import json
+import os
+import signal
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from companion.demo.flight import FlightPlan, FlightResult, describe_scenario, fly
+from companion.demo.flight import FlightFailed, FlightPlan, FlightResult, check_daemon, describe_scenario, fly
+from companion.errors import ConfigError
 
 _EPILOG = """\
 examples:
@@ -42,11 +46,21 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the unobstructed flight and the flight itself; report both."""
+    """Fly the unobstructed flight and the flight itself; report both.
+
+    Raises:
+        ConfigError: a scenario, configuration or folder that cannot be used, before anything flies.
+        FlightFailed: a process died or said no, or SIGINT or SIGTERM ended the demo; its processes are gone.
+    """
+    try:
+        return _run(arguments)
+    except KeyboardInterrupt:  # before or after the flights; during them the loop handles the signal
+        raise FlightFailed("demo: stopped by SIGINT") from None
+
+
+def _run(arguments: argparse.Namespace) -> int:
     described = describe_scenario(arguments.scenario, arguments.seed)
     if described["target"] is None:
-        from companion.errors import ConfigError
-
         raise ConfigError(f"scenario {arguments.scenario}: target: expected a position, the demo flies to it")
     folder = arguments.out or Path("flights") / time.strftime("%Y%m%d-%H%M%S")
     plan = FlightPlan(
@@ -61,8 +75,10 @@ def run(arguments: argparse.Namespace) -> int:
         sources=tuple(described["sources"]),
         control_hz=described["control_hz"],
     )
+    check_daemon(plan)
+    _make_folder(folder)
     with _Progress(quiet=arguments.json) as show:
-        free, flight = asyncio.run(_fly_both(plan, show))
+        free, flight = asyncio.run(_fly_until_told(plan, show))
         report = _report(free, flight)
         (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
         show("draw the picture")
@@ -72,6 +88,36 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         _print_table(report, flight, picture)
     return 0 if report["reached"] and not report["collided"] else 1
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        (folder / "unobstructed").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror
+    else:
+        reason = None if os.access(folder, os.W_OK | os.X_OK) else os.strerror(errno.EACCES)
+    if reason is not None:
+        raise ConfigError(f"--out {folder}: cannot be made ({reason}), expected a folder to write to")
+
+
+async def _fly_until_told(plan: FlightPlan, show: Callable[[str], None]) -> tuple[FlightResult, FlightResult]:
+    """Both flights; on SIGINT or SIGTERM the task is cancelled, so that each process is ended on the way out."""
+    loop, flying = asyncio.get_running_loop(), asyncio.create_task(_fly_both(plan, show))
+    told: list[signal.Signals] = []
+
+    def stop(number: signal.Signals) -> None:
+        told.append(number)
+        flying.cancel()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop, number)
+    try:
+        return await flying
+    except asyncio.CancelledError:
+        if not told:
+            raise
+        raise FlightFailed(f"demo: stopped by {told[0].name}") from None
 
 
 async def _fly_both(plan: FlightPlan, show: Callable[[str], None]) -> tuple[FlightResult, FlightResult]:

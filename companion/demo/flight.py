@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from companion.config import apply_overrides, load_config, parse_config
 from companion.errors import CompanionError, ConfigError
 
 STOP_S = 5.0  # a process that was asked to stop is given this long
@@ -161,8 +162,9 @@ async def _until_flown(simulator: _Process, daemon: _Process, operator: _Process
         if simulator.ended.done():
             break
         if daemon.ended.done():
-            kind = ConfigError if daemon.status == 2 else FlightFailed
-            raise kind(f"{daemon.name} ended before the flight did: {daemon.last_words()}")
+            if daemon.status == 2:  # its configuration: it has said so in one line that needs no frame
+                raise ConfigError(daemon.last_words().removeprefix("companion: "))
+            raise FlightFailed(f"{daemon.name} ended before the flight did: {daemon.last_words()}")
         if operator.ended.done() and operator.status != 0:
             raise FlightFailed(f"{operator.name}: {operator.last_words()}")
     return _parsed(simulator.ended.result(), simulator)
@@ -177,12 +179,32 @@ def _parsed(lines: list[str], process: _Process) -> dict[str, Any]:
     return parsed
 
 
+def check_daemon(plan: FlightPlan) -> None:
+    """Load the configuration that the daemon will be given.
+
+    Raises:
+        ConfigError: the daemon would refuse it; the message is the daemon's own.
+    """
+    settings = _daemon_settings(plan, 1, "tcp/127.0.0.1:1")  # the ports are chosen when the flight begins
+    if plan.config is None:
+        parse_config(apply_overrides({}, settings), source="demo")
+    else:
+        load_config(plan.config, settings)
+
+
 def _daemon_arguments(plan: FlightPlan, onboard: int, endpoint: str) -> list[str]:
     """The daemon's command line: a base configuration and what ties it to this simulator."""
     base = plan.config
     if base is None:
         base = plan.folder / "companion.toml"
         base.write_text("# everything at its default; the demo sets the links on the command line\n", encoding="utf-8")
+    words = ["-c", str(base)]
+    for setting in _daemon_settings(plan, onboard, endpoint):
+        words += ["--set", setting]
+    return words
+
+
+def _daemon_settings(plan: FlightPlan, onboard: int, endpoint: str) -> tuple[str, ...]:
     settings = [
         f'mavlink.url="udpin://127.0.0.1:{onboard}"',
         "mavlink.system_id=1",
@@ -193,10 +215,7 @@ def _daemon_arguments(plan: FlightPlan, onboard: int, endpoint: str) -> list[str
     ]
     if plan.lockstep:
         settings += ['sync="lockstep"', f"lockstep_sources={json.dumps(list(plan.sources))}"]
-    words = ["-c", str(base)]
-    for setting in (*settings, *plan.overrides):
-        words += ["--set", setting]
-    return words
+    return (*settings, *plan.overrides)
 
 
 def _free_port(kind: socket.SocketKind) -> int:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +81,59 @@ def test_mistakes_are_one_line_and_status_2(tmp_path: Path, words: list[str], ex
     lines = done.stderr.strip().splitlines()
     assert len(lines) == 1, done.stderr
     assert expected in lines[0]
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "file" / "out"
+    (tmp_path / "file").write_bytes(b"")
+    status, line = mistake("--out", str(folder))
+    assert status == 2
+    assert line == f"companion: --out {folder}: cannot be made (Not a directory), expected a folder to write to"
+
+
+def test_a_missing_configuration_is_named_once_and_nothing_starts(tmp_path: Path) -> None:
+    missing = tmp_path / "missing.toml"
+    status, line = mistake("--out", str(tmp_path / "out"), "-c", str(missing))
+    assert status == 2
+    assert line == f"companion: {missing}: cannot be read (No such file or directory), expected a TOML file"
+    assert not (tmp_path / "out").exists()
+
+
+def mistake(*words: str) -> tuple[int, str]:
+    """Exit status and the one line on standard error."""
+    command = [sys.executable, "-m", "companion.cli", "demo", "--lockstep", "--json", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1, done.stderr
+    return done.returncode, done.stderr.rstrip()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_simulator_and_the_daemon_too(tmp_path: Path, number: signal.Signals) -> None:
+    """Sent as soon as all three processes run, long before the first flight can be over."""
+    command = [sys.executable, "-m", "companion.cli", "demo", "--json", "--out", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo:
+        wanted = ("sim_bridge.cli run", "companion.cli run", "companion.demo.operator")
+        while len(found := [pid for words in wanted if (pid := _child(demo.pid, words))]) < len(wanted):
+            assert demo.poll() is None, demo.communicate()
+            os.sched_yield()
+        demo.send_signal(number)
+        said, complained = demo.communicate(timeout=20)
+    alive = [pid for pid in found if Path(f"/proc/{pid}").exists()]
+    for pid in alive:
+        os.kill(pid, signal.SIGKILL)
+    assert alive == []
+    assert (demo.returncode, said) == (1, "")
+    assert complained == f"companion: demo: stopped by {number.name}\n"
+
+
+def _child(parent: int, words: str) -> int | None:
+    """The child of ``parent`` with ``words`` in its command line, once it exists."""
+    for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
+        with suppress(FileNotFoundError, ProcessLookupError):
+            if words in Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode():
+                return int(pid)
+    return None
 
 
 @pytest.mark.slow
