@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +111,7 @@ class Daemon:
         self.mav = dialect.MAVLink(None, 1, 1)
         self.received: list[Any] = []
         self.statuses: queue.Queue[dict[str, Any]] = queue.Queue()
+        self.k = 0
         config = zenoh.Config()
         config.insert_json5("connect/endpoints", json.dumps([endpoint]))
         config.insert_json5("scouting/multicast/enabled", "false")
@@ -133,14 +134,14 @@ class Daemon:
     def _send(self, message: Any) -> None:
         self.socket.sendto(message.pack(self.mav), self.address)
 
-    def wait_status(self, accept: Any) -> dict[str, Any]:
-        """Keep the telemetry coming until a status is accepted."""
+    def wait_status(self, accept: Any, before_tick: Callable[[int], None] = lambda k: None) -> dict[str, Any]:
+        """Keep the telemetry coming until a status is accepted; ``before_tick`` is called with each tick's number."""
         deadline = time.monotonic() + 20.0
         last: dict[str, Any] = {}
-        k = 1
         while time.monotonic() < deadline:
-            self.fly(k)
-            k += 1
+            self.k += 1
+            before_tick(self.k)
+            self.fly(self.k)
             while not self.statuses.empty():
                 last = self.statuses.get()
                 if accept(last):
@@ -213,7 +214,13 @@ def test_noise_on_every_door_is_counted_and_survived(daemon: Daemon) -> None:
 
     status = daemon.wait_status(counted)
     assert status["state"] == "READY"
-    put("uav/uav1/obstacles/bad", json.dumps({"stamp_ns": 10**9, "clock": "vehicle", "obstacles": [far]}))
+
+    def put_far(k: int) -> None:  # with a stamp that this tick accepts, so that the range is what it is refused for
+        put("uav/uav1/obstacles/bad", json.dumps({"stamp_ns": 50_000_000 * k, "clock": "vehicle", "obstacles": [far]}))
+
+    status = daemon.wait_status(lambda status: status["counts"].get("obstacles.out_of_range", 0) > 0, put_far)
+    assert status["state"] == "READY"
+    assert status["tracks"] == 0
     assert daemon.process.poll() is None
 
 
