@@ -10,7 +10,7 @@ import numpy as np
 from companion.config import Config, config_hash
 from companion.errors import FrameRejected
 from companion.frames import enu_from_ned
-from companion.link import wire
+from companion.link import ingress, wire
 from companion.link.inbox import ObstacleInbox
 from companion.link.zenoh import ZenohHandlers
 from companion.metrics import TickMeter
@@ -95,7 +95,7 @@ class Doors:
 
     def _vehicle(self, payload: bytes, encoding: str) -> None:
         try:
-            vehicle = wire.vehicle_from_payload(wire.decode(payload, wire.VehicleStateIn, encoding))
+            vehicle = ingress.vehicle_from_payload(wire.decode(payload, wire.VehicleStateIn, encoding))
         except FrameRejected as error:
             self._inbox.reject("vehicle/state", error)
             return

@@ -23,7 +23,7 @@ import zenoh
 from companion.clock import Clock, SystemClock
 from companion.config import ZenohConfig
 from companion.errors import ConfigError, FrameRejected
-from companion.link import wire
+from companion.link import ingress, wire
 from companion.link.zenoh import open_session
 from companion.types import NS_PER_S
 
@@ -232,7 +232,7 @@ def _parsed(lines: Iterable[bytes], name: str) -> Iterator[_Line]:
             continue
         try:
             frame = wire.decode(text, wire.ObstacleFrame, wire.JSON)
-            wire.detections_from_frame(
+            ingress.detections_from_frame(
                 frame, source="file", sequence=0, now_ns=frame.stamp_ns, unix_minus_vehicle_ns=0, max_age_s=1.0
             )
         except FrameRejected as error:

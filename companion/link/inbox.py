@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from companion.errors import FrameRejected
-from companion.link import wire
+from companion.link import ingress, wire
 from companion.types import NS_PER_S, DetectionFrame
 
 MAX_PAYLOAD_BYTES = 1 << 20
@@ -132,7 +132,7 @@ class ObstacleInbox:
             while entry.queue and entry.queue[0][0] < limit:
                 sequence, payload, encoding = entry.queue.popleft()
                 try:
-                    frame = wire.detections_from_frame(
+                    frame = ingress.detections_from_frame(
                         wire.decode(payload, wire.ObstacleFrame, encoding),
                         source=name,
                         sequence=sequence,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from companion.errors import FrameRejected
-from companion.link import wire
+from companion.link import ingress, wire
 from companion.types import DetectionFrame, DetectionKind
 
 NOW_NS = 10_000_000_000
@@ -42,7 +42,7 @@ def accept(payload: bytes | dict[str, Any], encoding: str | None = None, **chang
         "unix_minus_vehicle_ns": UNIX_MINUS_VEHICLE_NS,
         "max_age_s": 0.5,
     }
-    return wire.detections_from_frame(wire.decode(data, wire.ObstacleFrame, encoding), **(settings | changes))
+    return ingress.detections_from_frame(wire.decode(data, wire.ObstacleFrame, encoding), **(settings | changes))
 
 
 def refuse(payload: bytes | dict[str, Any], encoding: str | None = None, **changes: Any) -> FrameRejected:
@@ -227,7 +227,6 @@ def test_covariance_is_the_upper_triangle_row_by_row() -> None:
     # independent: the variance along a direction does not depend on the axes it is written in
     north_up_ned, north_up_enu = np.array([1, 0, -1, 0, 2, 0.0]), np.array([0, 1, 1, 2, 0, 0.0])
     assert north_up_enu @ ball.covariance @ north_up_enu == pytest.approx(north_up_ned @ ned @ north_up_ned)
-    assert wire.triangle(ned) == pytest.approx(triangle)
 
 
 def test_msgpack_equals_json() -> None:
