@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,3 +46,18 @@ class TickMeter:
             "p99.9": round(float(p999), 4),
             "max": round(max(values), 4),
         }
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a run amounted to; ``companion run --json`` prints it."""
+
+    ticks: int
+    verdicts: dict[str, int]
+    tick_ms: dict[str, float]
+    deadline_misses: int
+    states_skipped: int
+    counts: dict[str, int]
+    final_state: str
+    log: str | None
+    log_hash: str

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import gc
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 from companion.clock import Clock, stopwatch_ns
@@ -23,7 +22,7 @@ from companion.link.inbox import ObstacleInbox
 from companion.link.mavlink import MavlinkCodec, packet_count
 from companion.link.transports import Transport, open_transport
 from companion.link.zenoh import ZenohLink
-from companion.metrics import TickMeter
+from companion.metrics import Summary, TickMeter
 from companion.pilot import Pilot, PilotOutput
 from companion.publisher import Publisher
 from companion.record import Recorder
@@ -49,21 +48,6 @@ _SYSTEM_STATUS = {
     State.OVERRIDDEN: mav.STATE_STANDBY,
     State.FAULT: mav.STATE_CRITICAL,
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a run amounted to; ``companion run --json`` prints it."""
-
-    ticks: int
-    verdicts: dict[str, int]
-    tick_ms: dict[str, float]
-    deadline_misses: int
-    states_skipped: int
-    counts: dict[str, int]
-    final_state: str
-    log: str | None
-    log_hash: str
 
 
 class Service:

@@ -18,8 +18,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from companion.clock import SystemClock
 from companion.config import parse_config
 from companion.errors import LockstepStalled
+from companion.metrics import Summary
 from companion.pilot import Pilot
-from companion.service import Service, Summary
+from companion.service import Service
 from sim_bridge.testing import free_port
 
 pytestmark = pytest.mark.integration
@@ -137,6 +138,14 @@ def run(script: Callable[[Service, Failing, Autopilot], Awaitable[None]], **sect
     return asyncio.run(both())
 
 
+def neighbour(endpoint: str) -> zenoh.Session:
+    """Another peer, connected to the daemon's endpoint and to nobody else."""
+    config = zenoh.Config()
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
 async def activate(autopilot: Autopilot) -> None:
     await autopilot.fly(3)
     autopilot.command(92, 1.0)
@@ -207,10 +216,7 @@ def test_the_vehicle_state_may_come_by_zenoh() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
 
     async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
-        config = zenoh.Config()
-        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-        config.insert_json5("scouting/multicast/enabled", "false")
-        with zenoh.open(config) as session:
+        with neighbour(endpoint) as session:
             states = session.declare_publisher("uav/uav1/vehicle/state")
             stamp_ms = 0
             while service._session.situation.state.value != "ACTIVE":
@@ -254,10 +260,7 @@ def test_unix_frames_without_a_time_base_mean_hold() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
 
     async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
-        config = zenoh.Config()
-        config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-        config.insert_json5("scouting/multicast/enabled", "false")
-        with zenoh.open(config) as session:
+        with neighbour(endpoint) as session:
             frames = session.declare_publisher("uav/uav1/obstacles/lidar")
             await activate(autopilot)
             for _ in range(10):

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -218,7 +218,8 @@ def flight(folder: Path, *, withhold: str = "", steps: tuple[str, ...] = ("arm",
             with socket.socket() as probe:
                 if probe.connect_ex(("127.0.0.1", int(endpoint.rsplit(":", 1)[1]))) == 0:
                     break
-            time.sleep(0.05)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=0.05)
         participants = [Companion(onboard, endpoint, ("camera", "radar"), withhold), Operator(ground, steps)]
         for each in participants:
             each.start()
