@@ -105,6 +105,14 @@ class Tracker:
             radius_m=_read_only(self._radius_m.copy()),
         )
 
+    def forecast(self, start_ns: int, tau_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Position of every track ``tau_s`` (K,) after ``start_ns``, (M, K, 3) [m], and its covariance.
+
+        The covariance has its entries xx, yy, zz, yz, xz, xy first: (M, 6, K) [m^2], spread of means included.
+        """
+        x, covariance = self._at(start_ns)
+        return predict_positions(x, covariance, self._bank.probabilities, horizon(tau_s, self._constants.models))
+
     def _at(self, t_ns: int) -> tuple[FloatArray, FloatArray]:
         """States and covariances of all models carried to ``t_ns``, each track from its own instant."""
         if self._carried is None or self._carried[0] != t_ns:
