@@ -1,4 +1,4 @@
-"""`companion`: run, demo, publish, schema. Exit status 0 done, 1 the thing failed, 2 wrong usage or configuration."""
+"""`companion`: its commands. Exit status 0 done, 1 the thing failed, 2 wrong usage or configuration."""
 
 from __future__ import annotations
 
@@ -37,10 +37,12 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
     from companion import publish
+    from companion.bench import command as bench
     from companion.demo import command as demo
 
     demo.add_parser(commands)
     publish.add_parser(commands)
+    bench.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")
     schema.add_argument("key", nargs="?", help="one key suffix, such as companion/setpoint; all where left out")
     schema.set_defaults(handler=_schema)

@@ -23,6 +23,7 @@ Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]
 Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
+Stay = Annotated[float, Meta(gt=0.34, lt=1.0)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -71,24 +72,30 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Process noises in physical units: 1-sigma of the white input of each model, per sqrt(Hz)."""
 
     preset: Literal["default", "paper"] = "default"
+    backend: Literal["batched", "reference"] = "batched"  # the same filter; reference: plainly on filterpy, and slow
     dt_s: Positive = 0.05  # the grid for which per-step constants are stated
-    accel_psd_cv: Positive = 0.6  # white acceleration PSD of CV [m^2/s^3]
-    jerk_psd_ca: Positive = 55.0  # white jerk PSD of CA [m^2/s^5]
-    accel_psd_ct: Positive = 0.0014  # white acceleration PSD of CT [m^2/s^3]
-    accel_memory_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 1.0  # CA's acceleration dies out in predictions; 0: never
-    turn_psd_ct: Positive = 0.0075  # white turn acceleration PSD of CT [rad^2/s^3]
+    accel_psd_cv: Positive = 4e-4  # white acceleration PSD of CV [m^2/s^3]
+    jerk_psd_ca: Positive = 30.0  # white jerk PSD of CA [m^2/s^5]
+    accel_psd_ct: Positive = 0.006  # white acceleration PSD of CT [m^2/s^3]
+    accel_memory_s: Annotated[float, Meta(ge=0.0, le=5.0)] = (
+        0.2  # CA's acceleration dies out with it (Singer); 0: it lasts
+    )
+    turn_psd_ct: Positive = 0.05  # white turn acceleration PSD of CT [rad^2/s^3]
     q_paper: NonNegative = 0.0  # > 0: Q = q_paper I per dt_s for every model (Remark 1)
     measurement_variance_m2: Positive = 0.05  # used where a detection states no position_std (Remark 1)
     force_measurement_variance: bool = False  # True: ignore stated position_std
-    stay_probability: Annotated[float, Meta(gt=0.34, lt=1.0)] = 0.995  # pi_jj per dt_s, the rest shared evenly
+    stay_probability: tuple[Stay, Stay, Stay] = (0.9935, 0.997, 0.986)  # pi_jj of CV, CA, CT per dt_s, the rest shared
     turn_rate: Literal["state", "window"] = "state"  # of CT: an extended state, or the heading change over turn_window
     turn_window: Annotated[int, Meta(ge=2, le=200)] = 20  # updates
-    turn_std_rad_s: Positive = 1.3  # turn rate of a new track, and what CV and CA know about it
+    turn_std_rad_s: Positive = 4.0  # turn rate of a new track, and what CV and CA know about it
     birth_speed_m_s: Positive = 3.0  # 1-sigma of each velocity axis of a new track
     birth_accel_m_s2: Positive = 3.0  # the same of its acceleration
     jump_sigma: Positive = 10.0  # a named detection farther off is skipped once, then the track restarts there
     likelihood_window: Annotated[int, Meta(ge=1, le=20)] = 1  # updates
     velocity_std_m_s: Positive = 0.5  # used where a detection states a velocity without its deviation
+    nis_memory_s: Positive = 4.0  # over which the innovations of a track's predictions are averaged
+    nis_bound: Positive = 0.97  # their root mean square, 1 for true models, above which a track breaks its own
+    inflation_max: Annotated[float, Meta(ge=1.0, le=100.0)] = 10.0  # most that this widens its predictions; 1: never
     gate_sigma: Positive = 4.0
     coast_s: Positive = 1.0  # a track without measurement is dropped after this
     max_tracks: Annotated[int, Meta(ge=1, le=1024)] = 128
@@ -209,10 +216,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "q_paper": 0.05,
             "measurement_variance_m2": 0.05,
             "force_measurement_variance": True,
-            "stay_probability": 0.6,
+            "stay_probability": (0.6, 0.6, 0.6),
             "turn_rate": "window",
             "likelihood_window": 2,
             "accel_memory_s": 0.0,
+            "inflation_max": 1.0,
         },
     },
 }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -41,7 +41,8 @@ class Cell:
 
     @property
     def name(self) -> str:
-        return f"sigma {self.sigma_m:g} m, {self.rate_hz:g} Hz, {self.dropout:.0%} lost, {self.latency_s * 1e3:.0f} ms late"
+        lost, late = f"{self.dropout:.0%} lost", f"{self.latency_s * 1e3:.0f} ms late"
+        return f"sigma {self.sigma_m:g} m, {self.rate_hz:g} Hz, {lost}, {late}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,84 +99,72 @@ def draw_trials(cell: Cell, *, seed: int, trials: int) -> Trials:
     )
 
 
-@dataclass(slots=True)
-class Errors:
-    """Squared errors of M obstacles, summed over the ticks that counted, and what became of the tracks."""
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Of each motion, (len(MOTIONS), ...): root mean squares over trials and ticks; a trailing axis is a grid's."""
 
-    now: FloatArray  # (M, ...) [m^2]
-    velocity: FloatArray  # [m^2/s^2]
-    ahead: FloatArray  # (len(AHEAD_S), M, ...) [m^2]
-    inside: FloatArray | None  # ticks at which the truth lay in the 95 % ellipsoid at +AHEAD_S[0]
-    nees: FloatArray | None  # sum of the normalised estimation error squared there, divided by 3
-    ticks: int
-    lost: int = 0
+    now_m: FloatArray
+    velocity_m_s: FloatArray
+    ahead_m: FloatArray  # (len(AHEAD_S), len(MOTIONS), ...)
+    coverage: FloatArray | None = None  # share of ticks with the truth in the 95 % ellipsoid at +AHEAD_S[0]
+    nees: FloatArray | None = None  # mean normalised estimation error squared there, three degrees of freedom
+    lost: int = 0  # tracks that ended
+    restarted: int = 0  # detections taken for outliers
 
 
 Estimate = tuple[FloatArray, FloatArray, list[FloatArray], FloatArray | None]
 
 
-def summed(trials: Trials, estimates: Iterable[Estimate]) -> Errors:
-    """Errors from (position, velocity, positions ahead, covariance at +AHEAD_S[0]) at every tick."""
-    errors: Errors | None = None
+def scored(trials: Trials, estimates: Iterable[Estimate]) -> Scores:
+    """Scores of (position, velocity, positions ahead, covariance at +AHEAD_S[0]) at every tick."""
+    sums: list[FloatArray] = []
     for k, (p, v, ahead, covariance) in enumerate(estimates):
         if k < trials.first:
             continue
-        grid = p.ndim - 2  # single-model filters carry a grid axis
-        at = (slice(None), *[None] * grid)
-        now = ((p - trials.now[k][at]) ** 2).sum(axis=-1)
-        velocity = ((v - trials.velocity[k][at]) ** 2).sum(axis=-1)
+        at = (slice(None), *[None] * (p.ndim - 2))  # single-model filters carry a grid axis
         off = [q - truth[k][at] for q, truth in zip(ahead, trials.ahead, strict=True)]
-        squared = np.array([(e**2).sum(axis=-1) for e in off])
-        inside = nees = None
+        errors = [p - trials.now[k][at], v - trials.velocity[k][at], *off]
+        terms = [(error**2).sum(axis=-1) for error in errors]
         if covariance is not None:
-            weighed = np.linalg.solve(covariance, off[0][..., None])[..., 0]
-            nees = (off[0] * weighed).sum(axis=-1)
-            inside = (nees <= CHI2_95).astype(np.float64)
-            nees = nees / 3.0
-        if errors is None:
-            errors = Errors(now, velocity, squared, inside, nees, 1)
-            continue
-        errors.now += now
-        errors.velocity += velocity
-        errors.ahead += squared
-        errors.ticks += 1
-        if inside is not None and errors.inside is not None and errors.nees is not None:
-            errors.inside += inside
-            errors.nees += nees
-    if errors is None:
-        raise ValueError("trials: expected more ticks than SETTLE_S takes")
-    return errors
+            nees = (off[0] * np.linalg.solve(covariance, off[0][..., None])[..., 0]).sum(axis=-1)
+            terms += [(nees <= CHI2_95).astype(np.float64), nees]
+        sums = terms if not sums else [total + term for total, term in zip(sums, terms, strict=True)]
+    ticks = trials.steps - trials.first
+    means = [
+        np.array([total[trials.motion == index].mean(axis=0) for index in range(len(MOTIONS))]) / ticks
+        for total in sums
+    ]
+    instants = len(AHEAD_S)
+    roots = [np.sqrt(mean) for mean in means[: 2 + instants]]
+    stated = means[2 + instants :]
+    coverage, nees = stated if stated else (None, None)
+    return Scores(roots[0], roots[1], np.array(roots[2:]), coverage, nees)
 
 
-def track(trials: Trials, config: TrackingConfig) -> Errors:
+def track(trials: Trials, config: TrackingConfig) -> Scores:
     """Ours: the tracker as it flies, one named detection of every obstacle in each frame."""
     cell, count = trials.cell, trials.z.shape[1]
-    tracker = Tracker(msgspec.structs.replace(config, max_tracks=1024))
+    tracker = Tracker(msgspec.structs.replace(config, max_tracks=count))
     names = [f"{m:04d}" for m in range(count)]
     latency_ns = round(cell.latency_s * NS_PER_S)
-    lost = 0
 
     def estimates() -> Iterator[Estimate]:
-        nonlocal lost
         for k in range(trials.steps):
             stamp_ns = round(k * trials.dt_s * NS_PER_S)
             found = tuple(
                 Detection(names[m], frozen(trials.z[k, m]), 0.2, cell.sigma_m)
-                for m in range(count)
-                if trials.seen[k, m]
+                for m in np.flatnonzero(trials.seen[k]).tolist()
             )
             now_ns = stamp_ns + latency_ns
             tracker.update([DetectionFrame(stamp_ns, "bench", k, DetectionKind.DETECTION, found)], now_ns)
-            if len(tracker) < count:
-                lost += count - len(tracker)
-                raise RuntimeError("a track was lost: the bench's sensors are never silent for coast_s")
             table = tracker.table()
+            if len(table) != count:
+                raise ValueError(f"{cell.name}: a track was lost; the bench expects gaps below coast_s")
             p, entries = tracker.forecast(now_ns, np.array(AHEAD_S))
             yield table.p_enu, table.v_enu, [p[:, 0], p[:, 1]], _full(entries[..., 0])
 
-    errors = summed(trials, estimates())
-    errors.lost = lost
-    return errors
+    scores = scored(trials, estimates())
+    return replace(scores, lost=tracker.dropped["lost"], restarted=tracker.dropped["outlier"])
 
 
 def _full(entries: FloatArray) -> FloatArray:
@@ -183,8 +172,8 @@ def _full(entries: FloatArray) -> FloatArray:
     return entries[:, [0, 5, 4, 5, 1, 3, 4, 3, 2]].reshape(-1, 3, 3)
 
 
-def track_single(trials: Trials, order: int, densities: FloatArray) -> Errors:
-    """CV (order 2) or CA (order 3) with each of ``densities``: errors carry a grid axis."""
+def track_single(trials: Trials, order: int, densities: FloatArray) -> Scores:
+    """CV (order 2) or CA (order 3) with each of ``densities``: scores carry a grid axis."""
 
     def estimates() -> Iterator[Estimate]:
         model = SingleModel(order, densities, trials.z[0], trials.cell.sigma_m)
@@ -195,10 +184,10 @@ def track_single(trials: Trials, order: int, densities: FloatArray) -> Errors:
             p, v = model.ahead(trials.cell.latency_s)
             yield p, v, [model.ahead(trials.cell.latency_s + tau)[0] for tau in AHEAD_S], None
 
-    return summed(trials, estimates())
+    return scored(trials, estimates())
 
 
-def track_filterpy(trials: Trials, *, accel_psd: float, jerk_psd: float, stay: float) -> Errors:
+def track_filterpy(trials: Trials, *, accel_psd: float, jerk_psd: float, stay: float) -> Scores:
     """filterpy's IMM, one estimator an obstacle, in a Python loop: that is how it is used."""
     late = trials.cell.latency_s
 
@@ -214,9 +203,14 @@ def track_filterpy(trials: Trials, *, accel_psd: float, jerk_psd: float, stay: f
             ahead = [np.array([imm.ahead(late + tau)[0] for imm in imms]) for tau in AHEAD_S]
             yield np.array([p for p, _ in now]), np.array([v for _, v in now]), ahead, None
 
-    return summed(trials, estimates())
+    return scored(trials, estimates())
 
 
-def by_motion(trials: Trials, values: FloatArray, ticks: int) -> FloatArray:
-    """Mean of per-obstacle sums over the trials of each motion: (M, ...) -> (len(MOTIONS), ...)."""
-    return np.array([values[trials.motion == index].mean(axis=0) / ticks for index in range(len(MOTIONS))])
+def hindsight(trials: Trials) -> Scores:
+    """Per motion and figure the best of CV and CA over their grids: what one could have known afterwards."""
+    both = track_single(trials, 2, CV_GRID), track_single(trials, 3, CA_GRID)
+
+    def best(of: Callable[[Scores], FloatArray]) -> FloatArray:
+        return np.asarray(np.minimum(*(of(scores).min(axis=-1) for scores in both)))
+
+    return Scores(best(lambda s: s.now_m), best(lambda s: s.velocity_m_s), best(lambda s: s.ahead_m))

@@ -99,21 +99,29 @@ class FilterpyImm:
     def step(self, dt_s: float, z: FloatArray | None) -> None:
         """``dt_s`` on, then use the position ``z``, None where it was lost."""
         for order, kalman, density in zip((2, 3), self._filters, self._densities, strict=True):
-            kalman.F, kalman.Q = _padded(order, dt_s, density)
+            kalman.F, kalman.Q = chain_of_axes(order, dt_s, density)
         self._imm.predict()
         if z is not None:
-            self._imm.update(z.reshape(3, 1))
+            self.use(z)
+
+    def use(self, z: FloatArray) -> None:
+        """Use the position ``z`` (3,)."""
+        self._imm.update(z.reshape(3, 1))
+
+    def position(self) -> tuple[FloatArray, FloatArray]:
+        """Fused position (3,) and its covariance (3, 3)."""
+        return np.asarray(self._imm.x[:3, 0]), np.asarray(self._imm.P[:3, :3])
 
     def ahead(self, tau_s: float) -> tuple[FloatArray, FloatArray]:
         """Fused position and velocity ``tau_s`` on, (3,) each."""
         state = sum(
-            weight * (_padded(order, tau_s, 0.0)[0] @ kalman.x[:, 0])
+            weight * (chain_of_axes(order, tau_s, 0.0)[0] @ kalman.x[:, 0])
             for weight, order, kalman in zip(self._imm.mu, (2, 3), self._filters, strict=True)
         )
         return np.asarray(state[:3]), np.asarray(state[3:6])
 
 
-def _padded(order: int, dt_s: float, density: float) -> tuple[FloatArray, FloatArray]:
+def chain_of_axes(order: int, dt_s: float, density: float) -> tuple[FloatArray, FloatArray]:
     """F and Q over [p, v, a] for three axes; a CV filter keeps its acceleration at zero."""
     f, q = np.zeros((9, 9)), np.zeros((9, 9))
     part_f, part_q = chain(order, dt_s)

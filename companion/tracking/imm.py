@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.config import TrackingConfig
+from companion.tracking.agility import Watch, build_watch, first_notes, growth_factor, look_back, take_notes
 from companion.tracking.models import (
     CT,
     HAS,
@@ -37,6 +38,7 @@ from companion.tracking.models import (
 )
 from companion.types import FloatArray
 
+_ENTRIES = np.array([0, 4, 8, 5, 2, 1])  # xx, yy, zz, yz, xz, xy of a row-major 3x3
 _LOG_2PI = math.log(2.0 * math.pi)
 _EYE = np.eye(MODELS)
 _WELL_CONDITIONED = 1e-4  # least determinant of S over the product of its diagonal
@@ -58,10 +60,12 @@ class Constants:
 
     models: MotionModels
     dt_s: float  # grid of the per-step constants
-    persistence: float  # eigenvalue of the Markov matrix per dt_s: (3 pi_jj - 1) / 2
+    switching_hz: FloatArray  # (3,) and
+    switching: FloatArray  # (3, 9), of the Markov matrix, see `markov`
     likelihood_window: int  # updates
     turn_window: int  # updates; 0: the turn rate is estimated as a state
     birth_variance: FloatArray  # (10,) of a new track; also the most that a foreign track may leave open
+    watch: Watch
 
 
 def build_constants(config: TrackingConfig) -> Constants:
@@ -69,14 +73,33 @@ def build_constants(config: TrackingConfig) -> Constants:
     deviations = np.repeat(
         [100.0, config.birth_speed_m_s, config.birth_accel_m_s2, config.turn_std_rad_s], (3, 3, 3, 1)
     )
+    models = build_models(config)
+    switching_hz, switching = _switching(config)
     return Constants(
-        models=build_models(config),
+        models=models,
         dt_s=config.dt_s,
-        persistence=(3.0 * config.stay_probability - 1.0) / 2.0,
+        switching_hz=switching_hz,
+        switching=switching,
         likelihood_window=config.likelihood_window,
         turn_window=config.turn_window if config.turn_rate == "window" else 0,
         birth_variance=deviations**2,
+        watch=build_watch(config, models),
     )
+
+
+def _switching(config: TrackingConfig) -> tuple[FloatArray, FloatArray]:
+    """Rates kappa (3,) [1/s] and projectors E (3, 9) of Pi(dt) = sum_k exp(kappa_k dt) E_k, see `markov`.
+
+    The matrix per ``dt_s`` has ``stay_probability`` on its diagonal, the rest of each row shared evenly. Balanced by
+    pi_i ~ 1 / (1 - stay_i) it is symmetric, so its eigenvalues are real, and positive for every stay above 1/3.
+    """
+    stay = np.array(config.stay_probability)
+    per_step = np.where(_EYE > 0.0, stay, 0.5 * (1.0 - stay[:, None]))
+    root = np.sqrt(1.0 / (1.0 - stay))
+    values, vectors = np.linalg.eigh(root[:, None] * per_step / root)
+    left, right = vectors / root[:, None], vectors * root[:, None]
+    projectors = left.T[:, :, None] * right.T[:, None, :]  # (k, from, to)
+    return np.log(values) / config.dt_s, projectors.swapaxes(1, 2).reshape(MODELS, MODELS**2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +111,8 @@ class Bank:
     probabilities: FloatArray  # (M, 3)
     history: FloatArray  # (M, W - 1, 3) log-likelihoods of the last updates, -inf where none
     headings: FloatArray  # (M, L, 2) angle turned [rad] and time taken [s] in the last updates; L = turn_window
+    notes: FloatArray  # (M, 25) predictions to be looked back on, see `agility`
+    means: FloatArray  # (M, 2) recent NIS of the predictions and share of S that grew, see `agility`
 
     def __len__(self) -> int:
         return len(self.x)
@@ -97,7 +122,7 @@ class Bank:
         return Bank(*(part[rows] for part in self.parts()))
 
     def parts(self) -> tuple[FloatArray, ...]:
-        return self.x, self.covariance, self.probabilities, self.history, self.headings
+        return self.x, self.covariance, self.probabilities, self.history, self.headings, self.notes, self.means
 
 
 def join(first: Bank, second: Bank) -> Bank:
@@ -131,11 +156,12 @@ def birth(z: FloatArray, noise: FloatArray, constants: Constants) -> Bank:
         np.full((count, MODELS), 1.0 / MODELS),
         np.full((count, constants.likelihood_window - 1, MODELS), -np.inf),
         np.zeros((count, constants.turn_window, 2)),
+        *first_notes(count),
     )
 
 
 def markov(dt: FloatArray, constants: Constants) -> FloatArray:
-    """Pi(dt) = exp(G dt), G the generator of the symmetric per-step matrix: 1/3 + (I - 1/3) persistence^(dt / dt_s).
+    """Pi(dt) = exp(G dt), G = log(Pi(dt_s)) / dt_s; transposed: [to, from].
 
     Shapes: dt (M,) -> (M, 3, 3), or (1, 3, 3) where all share one dt.
     """
@@ -149,13 +175,13 @@ def _shared_markov(dt_s: float, constants: Constants) -> FloatArray:
 
 
 def _markov(dt: FloatArray, constants: Constants) -> FloatArray:
-    decay = (constants.persistence ** (dt / constants.dt_s))[:, None, None]
-    return np.asarray((1.0 - decay) / MODELS + decay * _EYE)
+    matrices = (np.exp(dt[:, None] * constants.switching_hz) @ constants.switching).reshape(-1, MODELS, MODELS)
+    return np.asarray(np.maximum(matrices, 0.0))  # rounding leaves -1e-17 where dt is zero
 
 
 def mix(bank: Bank, dt: FloatArray, constants: Constants) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Interaction (18): mixed (x0, P0) of each model and its prior probability c (M, 3)."""
-    joint = markov(dt, constants) * bank.probabilities[:, None, :]  # (M, to, from), the Markov matrix being symmetric
+    joint = markov(dt, constants) * bank.probabilities[:, None, :]  # (M, to, from)
     prior = joint.sum(axis=2)
     weights = joint / prior[..., None]
     x, covariance = to_common(bank.x, bank.covariance)
@@ -234,9 +260,10 @@ def step(
     x, covariance = propagate(x, covariance, dt, constants.models)
     if covariance.size and covariance.max() > _VARIANCE_LIMIT:  # an absurd measurement tore the models apart
         covariance = _bounded(covariance, np.full(SIZE, _VARIANCE_LIMIT))
+    inflated = noise
     if foreign:
-        covariance, noise = _shared(covariance, prior, noise)
-    x, covariance, log_likelihood, nis = correct(x, covariance, z, noise)
+        covariance, inflated = _shared(covariance, prior, noise)
+    x, covariance, log_likelihood, nis = correct(x, covariance, z, inflated)
     if foreign:
         covariance = _bounded(covariance, constants.birth_variance)
     turn = x[:, CT, TURN]
@@ -253,7 +280,9 @@ def step(
     headings = bank.headings
     if constants.turn_window:
         headings = _turned(bank, fuse_mean(x, probabilities), dt)
-    return Bank(x, covariance, probabilities, history, headings), nis
+    notes, means, due = look_back(bank.notes, bank.means, dt, z[:, :3], noise[:, :3, :3], constants.watch)
+    notes = take_notes(notes, due, x, covariance, probabilities, constants.watch)
+    return Bank(x, covariance, probabilities, history, headings, notes, means), nis
 
 
 def _shared(covariance: FloatArray, prior: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -301,3 +330,19 @@ def fuse(x: FloatArray, covariance: FloatArray, probabilities: FloatArray) -> tu
     spread += offset[..., :, None] * offset[..., None, :]
     flat = spread.reshape(len(x), MODELS, SIZE * SIZE)
     return mean, (probabilities[:, None, :] @ flat).reshape(len(x), SIZE, SIZE)
+
+
+def widened(spread: FloatArray, bank: Bank, constants: Constants) -> FloatArray:
+    """Predicted position covariances (M, 6, K) of ``bank``, grown faster where a track breaks its models.
+
+    P(tau) -> P_0 + factor (P(tau) - P_0), P_0 that of the last update.
+    """
+    factor = growth_factor(bank.means, constants.watch)
+    agile = np.flatnonzero(factor > 1.0)
+    if not agile.size:
+        return spread
+    _, covariance = fuse(bank.x[agile], bank.covariance[agile], bank.probabilities[agile])
+    base = covariance[:, :3, :3].reshape(-1, 9)[:, _ENTRIES, None]
+    spread = spread.copy()
+    spread[agile] = base + factor[agile, None, None] * (spread[agile] - base)
+    return spread

@@ -1,8 +1,9 @@
 """The same IMM filter for one track, written plainly on filterpy's Kalman filters: what `imm` must equal.
 
 No batching, no padding: CV has 6 states, CA 9, CT 7, each a ``filterpy.kalman.KalmanFilter``; the Markov matrix is a
-matrix power, the white-noise covariances are filterpy's, the turn is written in sines and cosines as in (17). filterpy
-is not part of the base install and is imported only when a `ReferenceImm` is made.
+matrix power, noises are filterpy's or matrix exponentials, the turn is written in sines and cosines as in (17).
+`ReferenceBank` puts it behind the interface of the batched bank (``tracking.backend = "reference"``): one obstacle
+after the other, some hundred times slower. filterpy is not part of the base install and is imported only here.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from companion.types import FloatArray
 CV, CA, CT = range(3)
 _SIZES = (6, 9, 7)
 _COMMON = 10  # [p, v, a, Omega]
-_SLOTS = ([0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5, 6, 7, 8], [0, 1, 2, 3, 4, 5, 9])  # of each model in the common state
+SLOTS = ([0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5, 6, 7, 8], [0, 1, 2, 3, 4, 5, 9])  # of each model in the common state
 _TURN = 6  # of CT's own state
 _TURN_LIMIT_RAD_S = 10.0
 # Noise in the turn rate against a constant error of it, by integrations: 0 the rate, 1 the heading, 2 the position.
@@ -39,13 +40,13 @@ class ReferenceImm:
 
         self._config = config
         self.probabilities = [1 / 3] * 3
-        self._scores: list[list[float]] = []
-        self._headings: list[tuple[float, float]] = []
+        self.scores: list[list[float]] = []
+        self.headings: list[tuple[float, float]] = []
         self.filters: list[Any] = []
         deviations = {6: config.birth_accel_m_s2, 7: config.birth_accel_m_s2, 8: config.birth_accel_m_s2}
         deviations |= {3: config.birth_speed_m_s, 4: config.birth_speed_m_s, 5: config.birth_speed_m_s}
         deviations |= {9: config.turn_std_rad_s}
-        for size, slots in zip(_SIZES, _SLOTS, strict=True):
+        for size, slots in zip(_SIZES, SLOTS, strict=True):
             kalman = KalmanFilter(dim_x=size, dim_z=len(z))
             kalman.x = np.zeros((size, 1))
             kalman.x[: len(z), 0] = z
@@ -53,44 +54,66 @@ class ReferenceImm:
             kalman.P[: len(z), : len(z)] = noise
             self.filters.append(kalman)
 
-    def update(self, z: Sequence[float], noise: FloatArray, dt: float) -> None:
-        """One cycle: interaction, filtering, probability update."""
+    def update(self, z: Sequence[float], noise: FloatArray, dt: float, *, foreign: bool = False) -> list[float]:
+        """One cycle: interaction, filtering, probability update. Returns the NIS of every model."""
         before, _ = self.fused()
         prior = self._interact(dt)
-        scores = []
         for model, kalman in enumerate(self.filters):
-            kalman.dim_z = len(z)
             kalman.predict(F=self._jacobian(model, dt), Q=self._noise(model, dt))
             if model == CT:  # the mean goes by the transition itself, not by its derivative
                 kalman.x = self._mixed_turn
-            measured = np.eye(len(z), _SIZES[model])
-            kalman.update(np.array(z).reshape(-1, 1), R=noise, H=measured)
+        if foreign:
+            noise = self._intersect(prior, noise)
+        scores, nis = [], []
+        for model, kalman in enumerate(self.filters):
+            kalman.dim_z = len(z)
+            kalman.update(np.array(z).reshape(-1, 1), R=noise, H=np.eye(len(z), _SIZES[model]))
             deviation, s = kalman.y[:, 0], kalman.S
-            scores.append(
-                -0.5 * (deviation @ np.linalg.solve(s, deviation) + math.log(np.linalg.det(2.0 * math.pi * s)))
-            )
+            nis.append(float(deviation @ np.linalg.solve(s, deviation)))
+            scores.append(-0.5 * (nis[-1] + math.log(np.linalg.det(2.0 * math.pi * s))))
+        if foreign:
+            self._hold_to_birth()
         turn = self.filters[CT].x
         turn[_TURN, 0] = min(max(turn[_TURN, 0], -_TURN_LIMIT_RAD_S), _TURN_LIMIT_RAD_S)
         self._weigh(prior, scores, averaged=len(z) == 3)
         after, _ = self.fused()
         cross = before[3] * after[4] - before[4] * after[3]
         angle = math.atan2(cross, before[3] * after[3] + before[4] * after[4])
-        self._headings = [*self._headings, (angle, dt)][-self._config.turn_window :]
+        self.headings = [*self.headings, (angle, dt)][-self._config.turn_window :]
+        return nis
 
     def fused(self) -> tuple[FloatArray, FloatArray]:
         """Mean (10,) and covariance (10, 10) over [p, v, a, Omega], spread of means included (19)."""
         states = [self._common(model) for model in range(3)]
         return _moments(states, self.probabilities)
 
-    def predict(self, tau_s: float) -> tuple[FloatArray, FloatArray]:
-        """Fused mean (10,) and covariance (10, 10) carried ``tau_s`` on; the filters stay as they are."""
+    def carried(self, tau_s: float) -> list[tuple[FloatArray, FloatArray]]:
+        """State and covariance of every model ``tau_s`` on (or back, without noise); the filters stay as they are."""
         states = []
         for model, kalman in enumerate(self.filters):
             jacobian = self._jacobian(model, tau_s)
             x = kalman.x[:, 0]
             moved = self._turn(x, tau_s) if model == CT else jacobian @ x
-            states.append(_to_common(model, moved, jacobian @ kalman.P @ jacobian.T + self._noise(model, tau_s)))
+            noise = self._noise(model, tau_s) if tau_s > 0.0 else 0.0
+            states.append((moved, jacobian @ kalman.P @ jacobian.T + noise))
+        return states
+
+    def predict(self, tau_s: float) -> tuple[FloatArray, FloatArray]:
+        """Fused mean (10,) and covariance (10, 10) carried ``tau_s`` on; the filters stay as they are."""
+        states = [_to_common(model, *state) for model, state in enumerate(self.carried(tau_s))]
         return _moments(states, self.probabilities)
+
+    def forecast(self, tau_s: float) -> tuple[FloatArray, FloatArray]:
+        """Fused position (3,) and its covariance (3, 3) ``tau_s`` on, noise acting all the way there.
+
+        It is that of `predict` but for Remark 1, where Q = q I stands for a step: there every integral of the noise in
+        velocity and acceleration reaches the position too.
+        """
+        mean, spread = self.predict(tau_s)
+        q = self._config.q_paper / self._config.dt_s
+        through = [q * tau_s**3 / 3.0, q * (tau_s**3 / 3.0 + tau_s**5 / 20.0), q * tau_s**3 / 3.0]
+        extra = sum(weight * noise for weight, noise in zip(self.probabilities, through, strict=True))
+        return mean[:3], spread[:3, :3] + extra * np.eye(3)
 
     def _common(self, model: int) -> tuple[FloatArray, FloatArray]:
         return _to_common(model, self.filters[model].x[:, 0], self.filters[model].P)
@@ -100,7 +123,7 @@ class ReferenceImm:
         from scipy.linalg import fractional_matrix_power
 
         stay = self._config.stay_probability
-        step = np.full((3, 3), (1.0 - stay) / 2.0) + np.eye(3) * (stay - (1.0 - stay) / 2.0)
+        step = np.array([[stay[i] if i == j else (1.0 - stay[i]) / 2.0 for j in range(3)] for i in range(3)])
         markov = np.real(fractional_matrix_power(step, dt / self._config.dt_s))
         states = [self._common(model) for model in range(3)]
         if self._config.turn_rate == "state":
@@ -113,24 +136,41 @@ class ReferenceImm:
             joint = [self.probabilities[source] * markov[source, to] for source in range(3)]
             prior.append(sum(joint))
             mixed.append(_moments(states, [weight / prior[-1] for weight in joint]))
-        for kalman, slots, (x, covariance) in zip(self.filters, _SLOTS, mixed, strict=True):
+        for kalman, slots, (x, covariance) in zip(self.filters, SLOTS, mixed, strict=True):
             kalman.x = x[slots].reshape(-1, 1)
             kalman.P = covariance[np.ix_(slots, slots)]
         turn = self.filters[CT]
         if self._config.turn_rate == "window":
-            angle, taken = sum(a for a, _ in self._headings), sum(t for _, t in self._headings)
+            angle, taken = sum(a for a, _ in self.headings), sum(t for _, t in self.headings)
             turn.x[_TURN, 0] = angle / max(taken, self._config.dt_s)
             turn.P[_TURN, :] = turn.P[:, _TURN] = 0.0
         self._mixed_turn = self._turn(turn.x[:, 0], dt).reshape(-1, 1)
         return prior
 
+    def _intersect(self, prior: list[float], noise: FloatArray) -> FloatArray:
+        """Covariance intersection: P / w for every model, R / (1 - w) returned, w by traces of position."""
+        own = sum(c * float(np.trace(kalman.P[:3, :3])) for c, kalman in zip(prior, self.filters, strict=True))
+        other = float(np.trace(noise[:3, :3]))
+        weight = min(max(other / (own + other), 0.05), 0.95)
+        for kalman in self.filters:
+            kalman.P = kalman.P / weight
+        return noise / (1.0 - weight)
+
+    def _hold_to_birth(self) -> None:
+        """Repeated intersections open what is never measured without end: no surer and no vaguer than a new track."""
+        config = self._config
+        most = [100.0] * 3 + [config.birth_speed_m_s] * 3 + [config.birth_accel_m_s2] * 3 + [config.turn_std_rad_s]
+        for kalman, slots in zip(self.filters, SLOTS, strict=True):
+            scale = [min(1.0, most[slot] / math.sqrt(kalman.P[k, k])) for k, slot in enumerate(slots)]
+            kalman.P = np.diag(scale) @ kalman.P @ np.diag(scale)
+
     def _weigh(self, prior: list[float], scores: list[float], *, averaged: bool) -> None:
         """mu_j ~ c_j times the mean likelihood of the last updates; six-dimensional ones are not averaged."""
-        self._scores = [*self._scores, scores][-self._config.likelihood_window :] if averaged else [scores]
-        best = max(max(row) for row in self._scores)
-        likelihood = [sum(math.exp(row[model] - best) for row in self._scores) for model in range(3)]
+        self.scores = [*self.scores, scores][-self._config.likelihood_window :] if averaged else [scores]
+        best = max(max(row) for row in self.scores)
+        likelihood = [sum(math.exp(row[model] - best) for row in self.scores) for model in range(3)]
         if not averaged:
-            self._scores = []
+            self.scores = []
         joint = [c * value for c, value in zip(prior, likelihood, strict=True)]
         self.probabilities = [value / sum(joint) for value in joint]
 
@@ -154,13 +194,10 @@ class ReferenceImm:
 
     def _jacobian(self, model: int, dt: float) -> FloatArray:
         """F of CV and CA; of CT its derivative at the filter's state."""
-        if model != CT:
-            f = np.eye(_SIZES[model])
-            for axis in range(3):
-                f[axis, axis + 3] = dt
-                if model == CA:
-                    f[axis, axis + 6], f[axis + 3, axis + 6] = dt**2 / 2.0, dt
-            return f
+        if model == CV:
+            return np.asarray(np.eye(6) + dt * np.eye(6, k=3))
+        if model == CA:
+            return np.asarray(np.kron(self._singer(dt)[0], np.eye(3)), dtype=np.float64)
         x = self.filters[CT].x[:, 0]
         turn, v_x, v_y = x[_TURN], x[3], x[4]
         angle = turn * dt
@@ -177,6 +214,22 @@ class ReferenceImm:
         f[4, _TURN] = dt * (math.cos(angle) * v_x - math.sin(angle) * v_y)
         return f
 
+    def _singer(self, dt: float) -> tuple[FloatArray, FloatArray]:
+        """F and Q (3, 3) of one axis of CA, a' = -a / memory + white jerk, by van Loan's matrix exponential.
+
+        Source: van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 1978.
+        """
+        from scipy.linalg import expm
+
+        memory = self._config.accel_memory_s
+        drift = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / memory if memory else 0.0]])
+        block = np.zeros((6, 6))
+        block[:3, :3], block[3:, 3:] = -drift, drift.T
+        block[2, 5] = self._config.jerk_psd_ca
+        exponential = expm(block * dt)
+        f = exponential[3:, 3:].T
+        return f, np.asarray(f @ exponential[:3, 3:])
+
     def _noise(self, model: int, dt: float) -> FloatArray:
         from filterpy.common import Q_continuous_white_noise
 
@@ -184,7 +237,7 @@ class ReferenceImm:
         if config.q_paper > 0.0:
             return np.asarray(np.eye(size) * config.q_paper * dt / config.dt_s)
         if model == CA:
-            return np.asarray(Q_continuous_white_noise(3, dt, config.jerk_psd_ca, block_size=3, order_by_dim=False))
+            return np.asarray(np.kron(self._singer(dt)[1], np.eye(3)), dtype=np.float64)
         density = config.accel_psd_cv if model == CV else config.accel_psd_ct
         noise = np.zeros((size, size))
         noise[:6, :6] = Q_continuous_white_noise(2, dt, density, block_size=3, order_by_dim=False)
@@ -199,7 +252,7 @@ class ReferenceImm:
 
 def _to_common(model: int, x: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """[p, v, a, Omega] and its covariance; CT's acceleration is centripetal, Omega e_z x v."""
-    slots = _SLOTS[model]
+    slots = SLOTS[model]
     lift = np.zeros((_COMMON, _SIZES[model]))
     lift[slots, range(_SIZES[model])] = 1.0
     common = lift @ x

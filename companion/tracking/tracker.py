@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from companion.config import TrackingConfig
 from companion.tracking.associate import associate
-from companion.tracking.imm import Bank, birth, build_constants, fuse, fuse_mean, join, put, step
+from companion.tracking.imm import Bank, birth, build_constants, fuse, fuse_mean, join, put, step, widened
 from companion.tracking.measurement import Measurements, is_finite, measure
 from companion.tracking.models import propagate
 from companion.tracking.predict import horizon, largest_sigma, predict_positions
@@ -93,6 +93,7 @@ class Tracker:
             self._horizon = horizon(np.arange(float(steps)) * dt_s, self._constants.models)
         probabilities = self._bank.probabilities
         p_enu, spread = predict_positions(x, covariance, probabilities, self._horizon)
+        spread = widened(spread, self._bank, self._constants)
         mean = fuse_mean(x, probabilities)
         return Prediction(
             start_ns=start_ns,
@@ -111,7 +112,9 @@ class Tracker:
         The covariance has its entries xx, yy, zz, yz, xz, xy first: (M, 6, K) [m^2], spread of means included.
         """
         x, covariance = self._at(start_ns)
-        return predict_positions(x, covariance, self._bank.probabilities, horizon(tau_s, self._constants.models))
+        at = horizon(tau_s, self._constants.models)
+        p_enu, spread = predict_positions(x, covariance, self._bank.probabilities, at)
+        return p_enu, widened(spread, self._bank, self._constants)
 
     def _at(self, t_ns: int) -> tuple[FloatArray, FloatArray]:
         """States and covariances of all models carried to ``t_ns``, each track from its own instant."""

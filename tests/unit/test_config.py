@@ -61,7 +61,7 @@ def test_paper_preset_is_literal_and_can_be_overridden() -> None:
     assert (paper.safety.alpha1, paper.safety.alpha2, paper.safety.epsilon_max) == (0.8, 0.5, 2.0)
     assert (paper.safety.lambda_u, paper.safety.lambda_epsilon, paper.safety.lambda_delta) == (1.0, 10.0, 1e4)
     assert (paper.tracking.q_paper, paper.tracking.measurement_variance_m2) == (0.05, 0.05)
-    assert paper.tracking.stay_probability == 0.6
+    assert paper.tracking.stay_probability == (0.6, 0.6, 0.6)
     assert parse_config({"safety": {"preset": "paper", "horizon": 7}}).safety.horizon == 7
 
 

@@ -48,7 +48,7 @@ def test_bank_equals_filterpy_over_random_trajectories(config):
 
 def test_markov_matrix_rows_sum_to_one_and_compose():
     constants = build_constants(PAPER)
-    pi = markov(np.array([0.05, 0.1, 0.013, 0.0, 30.0]), constants)
+    pi = markov(np.array([0.05, 0.1, 0.013, 0.0, 30.0]), constants).swapaxes(1, 2)  # [from, to]
     np.testing.assert_allclose(pi.sum(axis=2), 1.0, atol=1e-15)
     assert (pi >= 0.0).all()
     step_matrix = np.full((3, 3), 0.2) + 0.4 * np.eye(3)
@@ -62,7 +62,7 @@ def test_certain_model_is_a_single_kalman_filter():
     from filterpy.common import Q_continuous_white_noise
     from filterpy.kalman import KalmanFilter
 
-    config = TrackingConfig(stay_probability=1.0 - 1e-15)
+    config = TrackingConfig(stay_probability=(1.0 - 1e-15,) * 3)
     constants = build_constants(config)
     rng = np.random.default_rng(2)
     p, _ = wander(rng, 1, 40)

@@ -8,7 +8,7 @@ import pytest
 from companion.config import TrackingConfig, parse_config
 from companion.tracking.models import CA, CT, CV, HAS, SIZE, TURN, build_models, propagate, to_common, turn_terms
 
-MODELS = build_models(TrackingConfig())
+MODELS = build_models(TrackingConfig(accel_memory_s=0.0))  # CA to the letter of (16)
 
 
 def one(model: int, state: list[float]) -> np.ndarray:
@@ -79,7 +79,7 @@ def test_turn_terms_are_their_integrals(turn):
 def test_white_noise_matrices_are_filterpys():
     from filterpy.common import Q_continuous_white_noise
 
-    config = TrackingConfig()
+    config = TrackingConfig(accel_memory_s=0.0)
     dt = np.array([0.03, 0.2])
     _, noise = propagate(np.zeros((2, 3, SIZE)), np.zeros((2, 3, SIZE, SIZE)), dt, MODELS)
     for row, step in enumerate(dt):
@@ -87,6 +87,33 @@ def test_white_noise_matrices_are_filterpys():
         ca = Q_continuous_white_noise(3, step, config.jerk_psd_ca, block_size=3, order_by_dim=False)
         np.testing.assert_allclose(noise[row, CV, :6, :6], cv, atol=1e-15)
         np.testing.assert_allclose(noise[row, CA, :9, :9], ca, atol=1e-13)
+
+
+@pytest.mark.parametrize("memory_s", [0.2, 1.0, 5.0])
+@pytest.mark.parametrize("dt", [0.004, 0.05, 0.5, 1.0])
+def test_dying_accelerations_are_singers_by_the_matrix_exponential(memory_s, dt):
+    """F and Q of p' = v, v' = a, a' = -a / memory + white jerk by van Loan's method, each axis alike."""
+    from scipy.linalg import expm
+
+    config = TrackingConfig(accel_memory_s=memory_s)
+    drift = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / memory_s]])
+    block = np.block([[-drift, np.diag([0.0, 0.0, config.jerk_psd_ca])], [np.zeros((3, 3)), drift.T]])
+    exponential = expm(block * dt)
+    f = exponential[3:, 3:].T
+    models = build_models(config)
+    state = np.array([1.0, 2.0, 3.0, 0.5, -0.4, 0.3, 2.0, -1.0, 0.6, 0.0])
+    moved, noise = propagate(one(CA, state), np.zeros((1, 3, SIZE, SIZE)), np.array([dt]), models)
+    np.testing.assert_allclose(moved[0, CA, :9], np.kron(f, np.eye(3)) @ state[:9], rtol=1e-12)
+    q = np.kron(f @ exponential[:3, 3:], np.eye(3))
+    np.testing.assert_allclose(noise[0, CA, :9, :9], q, rtol=1e-6, atol=1e-6 * q.max())
+
+
+def test_a_memory_without_end_is_the_plain_acceleration():
+    far, plain = build_models(TrackingConfig(accel_memory_s=5.0)), MODELS
+    state, dt = [0.0] * 6 + [1.0, 0.0, 0.0, 0.0], np.array([1e-3])
+    nearly = propagate(one(CA, state), np.zeros((1, 3, SIZE, SIZE)), dt, far)[0][0, CA]
+    exact = propagate(one(CA, state), np.zeros((1, 3, SIZE, SIZE)), dt, plain)[0][0, CA]
+    np.testing.assert_allclose(nearly, exact, rtol=3e-4, atol=1e-15)
 
 
 def test_turn_noise_is_the_spread_of_wandering_turn_rates():

@@ -1,0 +1,121 @@
+"""`companion bench PART`: measures a part of the daemon beside its rivals, in one run, on this machine."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import msgspec
+
+_EPILOG = """\
+examples:
+  companion bench tracking                accuracy, identity and time of the tracker beside its rivals (minutes)
+  companion bench tracking --quick        the two headline conditions on fewer trials (under two minutes)
+  companion bench tracking --json > tracking.json
+"""
+
+_TRACKING = """\
+Tracks nine fixed motions (straight, accelerating, circle, three figure eights, climbing turn, jink, dash and stop)
+with our tracker, the paper's settings, CV alone, CA alone, filterpy's IMM and the hindsight filter (per motion the
+best of CV and CA over a grid of process noise), all on the same measurements. Then ten anonymous obstacles that cross
+for a minute, and the time of an update and prediction beside filterpy's update loop. Seeds are fixed, and disjoint
+from those that anything was tuned on. filterpy is part of the dev extra; without it its rows are left out.
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The `bench` command with one subcommand a part."""
+    bench = commands.add_parser(
+        "bench",
+        help="measure a part beside its rivals",
+        description="Measure a part of the daemon beside its rivals.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parts = bench.add_subparsers(dest="part", required=True, metavar="PART")
+    tracking = parts.add_parser(
+        "tracking",
+        help="the tracker: accuracy, covariance, identity, time",
+        description=_TRACKING,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    depth = tracking.add_mutually_exclusive_group()
+    depth.add_argument("--quick", action="store_true", help="the headline conditions only, on four trials a motion")
+    depth.add_argument("--all", action="store_true", help="every combination of noise, rate, dropout and latency")
+    depth.add_argument(
+        "--tune-rivals", action="store_true", help="instead: search the rivals' process noises on the tuning seed"
+    )
+    tracking.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else there")
+    tracking.set_defaults(handler=_tracking)
+
+
+def _tracking(arguments: argparse.Namespace) -> int:
+    from companion.bench import tracking
+    from companion.bench.accuracy import Cell
+    from companion.bench.envelope import envelope
+    from companion.bench.tables import print_tracking
+    from companion.bench.timing import Timing
+
+    filterpy = importlib.util.find_spec("filterpy") is not None
+    if arguments.tune_rivals:
+        if not filterpy:
+            print("companion: bench tracking: --tune-rivals needs filterpy (the dev extra)", file=sys.stderr)
+            return 2
+        _print_json(tracking.tune_rivals(tracking.TRIALS))
+        return 0
+    trials = 4 if arguments.quick else tracking.TRIALS
+    cells = list(tracking.HEADLINE) if arguments.quick else tracking.cells(every=arguments.all)
+    seeds = tracking.CROSSING_SEEDS[:1] if arguments.quick else tracking.CROSSING_SEEDS
+    results: list[tracking.CellResult] = []
+    crossings: dict[int, Any] = {}
+    times: list[Timing] = []
+
+    def measure_cell(cell: Cell) -> None:
+        headline = filterpy and cell in tracking.HEADLINE
+        results.append(tracking.measure_cell(cell, seed=tracking.REPORT_SEED, trials=trials, filterpy=headline))
+
+    def measure_crossing(seed: int) -> None:
+        crossings[seed] = tracking.measure_crossing(seed, filterpy=filterpy)
+
+    def measure_times() -> None:
+        times.extend(tracking.measure_times(filterpy=filterpy, repeats=100 if arguments.quick else 400))
+
+    jobs: list[tuple[str, Callable[[], None]]] = [("time", measure_times)]  # first, while nothing else is warm
+    jobs += [(cell.name, partial(measure_cell, cell)) for cell in cells]
+    jobs += [(f"crossing, seed {seed}", partial(measure_crossing, seed)) for seed in seeds]
+    _run(jobs)
+    figures = tracking.figures(results, crossings, times)
+    if arguments.json:
+        _print_json(envelope("tracking", tracking.as_json(results, crossings, times), figures))
+    else:
+        print_tracking(results, crossings, times, figures)
+    return 0
+
+
+def _run(jobs: list[tuple[str, Callable[[], None]]]) -> None:
+    """One after the other, with a progress bar on a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        bar = progress.add_task("", total=len(jobs))
+        for name, job in jobs:
+            progress.update(bar, description=name)
+            job()
+            progress.advance(bar)
+
+
+def _print_json(value: Any) -> None:
+    print(msgspec.json.format(msgspec.json.encode(value), indent=2).decode())
