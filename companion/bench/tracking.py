@@ -212,9 +212,9 @@ def tune_rivals(trials: int) -> dict[str, Any]:
         (accel, jerk, stay): float(
             cost([track_filterpy(one, accel_psd=accel, jerk_psd=jerk, stay=stay).ahead_m[0] for one in few])
         )
-        for accel in (0.01, 0.1, 1.0)
-        for jerk in (3.0, 30.0, 100.0)
-        for stay in (0.9, 0.97, 0.99)
+        for accel in (0.001, 0.01, 0.1, 1.0)
+        for jerk in (0.3, 1.0, 3.0, 10.0, 30.0)
+        for stay in (0.8, 0.9, 0.97, 0.99)
     }
     accel, jerk, stay = min(tried, key=lambda key: tried[key])
     return {

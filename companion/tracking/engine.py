@@ -69,9 +69,11 @@ class BatchedEngine:
     ) -> tuple[FloatArray, FloatArray]:
         if len(x) <= BLOCK:
             return predict.predict_positions(x, covariance, probabilities, at)
-        p_enu, spread = np.empty((len(x), len(at.tau_s), 3)), np.empty((len(x), 6, len(at.tau_s)))
+        steps = at.tau_s.shape[1]
+        p_enu, spread = np.empty((len(x), steps, 3)), np.empty((len(x), 6, steps))
         for rows in _blocks(len(x)):
-            p_enu[rows], spread[rows] = predict.predict_positions(x[rows], covariance[rows], probabilities[rows], at)
+            block = (x[rows], covariance[rows], probabilities[rows])
+            p_enu[rows], spread[rows] = predict.predict_positions(*block, at.of(rows))
         return p_enu, spread
 
 

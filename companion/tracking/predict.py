@@ -17,7 +17,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.tracking.models import CA, CT, MODELS, SIZE, TURN, A, MotionModels, P, V, horizontal_velocity, turn_terms
+from companion.tracking.models import (
+    CA,
+    CT,
+    MODELS,
+    SIZE,
+    TURN,
+    A,
+    MotionModels,
+    P,
+    V,
+    acceleration_response,
+    horizontal_velocity,
+    turn_terms,
+)
 from companion.types import FloatArray
 
 _BASIS = 7
@@ -41,39 +54,53 @@ def _ct_parts() -> FloatArray:
 
 
 _PARTS = _ct_parts()
-_PARTS_T = np.ascontiguousarray(_PARTS.T)
+_PARTS_T = np.ascontiguousarray(_PARTS[:_MEANS].T)
 # (6, 49): where entry (r, c) of S_kl stands in the flattened (21, 21)
 _ENTRY_OF = np.array(
     [[(3 * k + r) * _ALL + 3 * m + c for k in range(_BASIS) for m in range(_BASIS)] for r, c in _ENTRIES]
 )
+# Every e_k of CT is one component of its state or none, with a sign: its second moments are picked, not multiplied.
+_CT_SIGN = _PARTS.sum(axis=1)
+_CT_FROM = np.abs(_PARTS).argmax(axis=1)
+_CT_SIGNS = np.outer(_CT_SIGN, _CT_SIGN).ravel()
+_CT_PICK = (_CT_FROM[:, None] * SIZE + _CT_FROM).ravel()
 
 
 @dataclass(frozen=True, slots=True)
 class Horizon:
-    """The instants of a prediction and what depends on nothing else; `horizon` makes it, once for many ticks."""
+    """The instants of a prediction and what depends on nothing else; `horizon` makes it, once for many ticks.
 
-    tau_s: FloatArray  # (K,) after the start, >= 0
-    reach: FloatArray  # (3, K): what position, velocity and acceleration contribute, 1, tau, phi
-    noise: FloatArray  # (3, K): position variance of each model's own noise [m^2]
-    turn_noise: FloatArray  # (K,): q tau / 5, the turn rate's wandering as a variance of its constant error
+    L = 1 where all tracks share their instants, else L = M.
+    """
+
+    tau_s: FloatArray  # (L, K) after the state, >= 0
+    reach: FloatArray  # (L, 3, K): what position, velocity and acceleration contribute, 1, tau, phi
+    noise: FloatArray  # (L, 3, K): position variance of each model's own noise [m^2]
+    turn_noise: FloatArray  # (L, K): q tau / 5, the turn rate's wandering as a variance of its constant error
+
+    def of(self, rows: slice) -> Horizon:
+        """The instants of some tracks."""
+        if len(self.tau_s) == 1:
+            return self
+        return Horizon(self.tau_s[rows], self.reach[rows], self.noise[rows], self.turn_noise[rows])
 
 
 def horizon(tau_s: FloatArray, models: MotionModels) -> Horizon:
-    """Constants of the instants ``tau_s``.
+    """Constants of the instants ``tau_s``, (K,) for all tracks or (M, K).
 
     An acceleration with a memory T = 1 / alpha dies out as it is carried on: it moves the obstacle by
     phi(tau) = (alpha tau - 1 + e^(-alpha tau)) / alpha^2, tau^2 / 2 where alpha is zero, and white jerk of density q
     leaves q times the integral of phi^2.
     """
-    noise = models.prediction_noise @ (tau_s[:, None] ** np.arange(6.0)).T
+    tau_s = np.atleast_2d(tau_s)
+    noise = models.prediction_noise @ (tau_s[:, None] ** np.arange(6.0)[:, None])
     alpha = models.accel_decay_hz
-    phi = 0.5 * tau_s * tau_s
+    phi = acceleration_response(tau_s, alpha)[0]
     if alpha > 0.0:
         aged, left = alpha * tau_s, np.exp(-alpha * tau_s)
-        phi = (aged - 1.0 + left) / alpha**2
         squared = (((aged - 1.0) ** 3 + 1.0) / 3.0 - 2.0 * aged * left + 0.5 * (1.0 - left * left)) / alpha**5
-        noise[CA] = models.jerk_psd * squared
-    return Horizon(tau_s, np.stack((np.ones_like(tau_s), tau_s, phi)), noise, 0.2 * models.turn_psd * tau_s)
+        noise[:, CA] = models.jerk_psd * squared
+    return Horizon(tau_s, np.stack((np.ones_like(tau_s), tau_s, phi), axis=1), noise, 0.2 * models.turn_psd * tau_s)
 
 
 def predict_positions(
@@ -87,13 +114,13 @@ def predict_positions(
         p_enu (M, K, 3) [m] and the entries xx, yy, zz, yz, xz, xy of its covariance (M, 6, K) [m^2], spread of means
         included.
     """
-    tracks, steps = x.shape[0], at.tau_s.shape[0]
+    tracks, steps = x.shape[0], at.tau_s.shape[1]
     basis = _basis(x, at)
     mean, second = _moments(x, covariance, probabilities)
     p_enu = basis[:, :5].swapaxes(1, 2) @ mean.reshape(tracks, 5, 3)
     products = (basis[:, :, None] * basis[:, None]).reshape(tracks, _BASIS**2, steps)
     spread = second.reshape(tracks, _ALL**2).take(_ENTRY_OF, axis=1) @ products
-    spread[:, :3] += (probabilities @ at.noise)[:, None]
+    spread[:, :3] += probabilities[:, None] @ at.noise
     wandering = (probabilities[:, CT, None] * at.turn_noise)[:, None] * basis[:, 5:]
     spread[:, :2] += wandering * basis[:, 5:]
     spread[:, _XY] += wandering[:, 0] * basis[:, 6]
@@ -104,7 +131,7 @@ def _basis(x: FloatArray, at: Horizon) -> FloatArray:
     """b (M, 7, K)."""
     _, integral, slope = turn_terms(x[:, CT, TURN, None], at.tau_s)
     column = slope * horizontal_velocity(x)[:, None]
-    basis = np.empty((x.shape[0], _BASIS, at.tau_s.shape[0]))
+    basis = np.empty((x.shape[0], _BASIS, at.tau_s.shape[1]))
     basis[:, :3] = at.reach
     # less tau: what CT does not share with CV, so that fast obstacles cost no digits
     basis[:, 3], basis[:, 4] = integral.real - at.tau_s, integral.imag
@@ -116,11 +143,13 @@ def _moments(x: FloatArray, covariance: FloatArray, probabilities: FloatArray) -
     """Mean (M, 15) and second moments (M, 21, 21) of the fused e_k; the mean of the last two is zero."""
     parts = np.zeros((x.shape[0], MODELS, _MEANS))
     parts[..., :_LASTING] = x[..., :_LASTING]
-    parts[:, CT, _LASTING:] = x[:, CT] @ _PARTS_T[:, _LASTING:_MEANS]
+    parts[:, CT, _LASTING:] = x[:, CT] @ _PARTS_T[:, _LASTING:]
     mean = (probabilities[:, None] @ parts)[:, 0]
     parts -= mean[:, None]
     weighted = covariance * probabilities[..., None, None]
-    second: FloatArray = _PARTS @ weighted[:, CT] @ _PARTS_T
+    second: FloatArray = weighted[:, CT].reshape(-1, SIZE * SIZE).take(_CT_PICK, axis=1)
+    second *= _CT_SIGNS
+    second = second.reshape(-1, _ALL, _ALL)
     second[:, :_LASTING, :_LASTING] += (weighted[:, 0] + weighted[:, CA])[:, :_LASTING, :_LASTING]
     second[:, :_MEANS, :_MEANS] += (parts * probabilities[..., None]).swapaxes(1, 2) @ parts
     return mean, second

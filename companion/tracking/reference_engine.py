@@ -55,11 +55,11 @@ class ReferenceEngine:
     def predict(
         self, x: FloatArray, covariance: FloatArray, probabilities: FloatArray, at: Horizon
     ) -> tuple[FloatArray, FloatArray]:
-        count, instants = len(x), at.tau_s.tolist()
-        p_enu, spread = np.zeros((count, len(instants), 3)), np.zeros((count, 6, len(instants)))
+        count, steps = len(x), at.tau_s.shape[1]
+        p_enu, spread = np.zeros((count, steps, 3)), np.zeros((count, 6, steps))
         for row in range(count):
             track = self._load(x[row], covariance[row], probabilities[row])
-            for k, tau_s in enumerate(instants):
+            for k, tau_s in enumerate(np.broadcast_to(at.tau_s, (count, steps))[row].tolist()):
                 p_enu[row, k], whole = track.forecast(tau_s)
                 spread[row, :, k] = [whole[entry] for entry in _UPPER]
         return p_enu, spread
