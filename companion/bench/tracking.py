@@ -38,7 +38,7 @@ HEADLINE = (Cell(0.22, 20.0), Cell(0.05, 20.0))
 # The rivals' process noises: the best of `tune_rivals` on TUNING_SEED, mean over the motions and both HEADLINE cells.
 CV_PSD = 1.0  # [m^2/s^3]
 CA_PSD = 3.16  # [m^2/s^5]
-FILTERPY = {"accel_psd": 0.1, "jerk_psd": 30.0, "stay": 0.97}
+FILTERPY = {"accel_psd": 0.001, "jerk_psd": 10.0, "stay": 0.97}
 
 
 def cells(*, every: bool) -> list[Cell]:
