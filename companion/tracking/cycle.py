@@ -1,0 +1,111 @@
+"""One frame in, the next picture out: gate, associate, recognise ourselves, update, split, begin, confirm, merge.
+
+A pure function of the picture, the frame and the vehicle's path, so that frames can be consumed again from any
+earlier picture.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.config import TrackingConfig
+from companion.tracking.advance import advance
+from companion.tracking.identity import Found, associated, disagreeing_names, sightings_by_key, usable
+from companion.tracking.imm import Constants
+from companion.tracking.lifecycle import bound, confirm, expire
+from companion.tracking.merge import merge_agreeing, tell_apart
+from companion.tracking.ownship import OwnPath, Suspects
+from companion.tracking.picture import Picture, Source, hear
+from companion.tracking.recognise import in_question, recognise
+from companion.tracking.tracks import Origin, Sightings, Tracks, join_tracks, newborn, unique_id
+from companion.types import DetectionFrame, DetectionKind
+
+_NONE = np.zeros(0, dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rules:
+    """What consuming a frame needs besides the picture."""
+
+    config: TrackingConfig
+    constants: Constants
+    vehicle_radius_m: float
+    coast_ns: int
+
+
+def consume(picture: Picture, frame: DetectionFrame, rules: Rules, path: OwnPath) -> Picture:
+    """The picture after ``frame``."""
+    config, stamp_ns = rules.config, frame.stamp_ns
+    trusted = frame.source not in config.untrusted
+    counts = picture.counts.copy()
+    tracks = expire(picture.tracks, stamp_ns - rules.coast_ns, counts, spare_trusted=not trusted)
+    source, new_look = hear(picture.sources.get(frame.source), len(picture.sources), stamp_ns)
+    found = usable(frame, source.anonymous_ns, counts)
+    suspects, used = picture.suspects, _NONE
+    if found.names:
+        tracks, sightings, suspects = _placed(tracks, suspects, found, frame, trusted, rules, path, counts)
+        foreign = frame.kind is DetectionKind.TRACK
+        tracks, fresh, used = advance(
+            tracks, sightings, source.number, stamp_ns, config, rules.constants, counts, foreign=foreign
+        )
+        if len(fresh):
+            origin = Origin(stamp_ns, source.number, trusted, unchecked=path.at(stamp_ns) is None)
+            tracks, source = _begin(tracks, fresh, source, origin, rules)
+        if found.named < len(found.names):
+            source = replace(source, anonymous_ns=stamp_ns)
+    sources = {**picture.sources, frame.source: source}
+    tracks = confirm(tracks, used, source.number, stamp_ns, config.confirm_hits, counts, new_look=new_look)
+    watch = picture.watch
+    if len(sources) > 1 and config.merge_s > 0.0:
+        tracks = tell_apart(tracks, source.number, stamp_ns)
+        tracks, watch = merge_agreeing(tracks, watch, stamp_ns, config.merge_s, rules.constants)
+    if len(tracks) > config.max_tracks:
+        own = path.at(stamp_ns)
+        tracks = bound(tracks, config.max_tracks, path.newest if own is None else own.p_enu, counts)
+    return Picture(tracks, sources, suspects, watch, counts)
+
+
+def _placed(
+    tracks: Tracks,
+    suspects: Suspects,
+    found: Found,
+    frame: DetectionFrame,
+    trusted: bool,
+    rules: Rules,
+    path: OwnPath,
+    counts: Counter[str],
+) -> tuple[Tracks, Sightings, Suspects]:
+    """What of a frame goes to tracks, each with its row or as a birth; our own detections taken out."""
+    stamp_ns = frame.stamp_ns
+    sightings = sightings_by_key(found, tracks, suspects, stamp_ns, rules.config, counts)
+    tracks, sightings = disagreeing_names(tracks, sightings)
+    if not in_question(tracks, sightings).size:  # every obstacle known by its name, the common case
+        return tracks, sightings, suspects
+    own = path.at(stamp_ns)
+    if found.named < len(found.names):
+        evidence = suspects.get((frame.source, None))
+        pseudo = own if evidence is not None and evidence.lives(stamp_ns) else None
+        sightings = associated(tracks, sightings, stamp_ns, trusted, pseudo, rules.config, rules.constants)
+    recognised = recognise(tracks, sightings, suspects, stamp_ns, own, rules.vehicle_radius_m)
+    if recognised.own:
+        counts["own_vehicle"] += recognised.own
+    return recognised.tracks, recognised.sightings, recognised.suspects
+
+
+def _begin(tracks: Tracks, fresh: Sightings, source: Source, origin: Origin, rules: Rules) -> tuple[Tracks, Source]:
+    """Tracks with a new one for each of ``fresh``."""
+    config, taken, born = rules.config, set(tracks.ids), source.born
+    ids = []
+    for name, identity in fresh.names:
+        born += identity is None
+        ids.append(unique_id(f"{name}/#{born}" if identity is None else f"{name}/{identity}", taken))
+        taken.add(ids[-1])
+    for full in (False, True):
+        chosen = np.flatnonzero(fresh.measurements.full == full)
+        if chosen.size:
+            part = newborn(fresh.take(chosen), tuple([ids[k] for k in chosen]), origin, config, rules.constants)
+            tracks = join_tracks(tracks, part)
+    return tracks, replace(source, born=born)
