@@ -8,7 +8,7 @@ outside `gate_sigma`: then the sources do not see the same obstacle.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from companion.config import TrackingConfig
 from companion.tracking.identity import unbound, with_anonymous_keys
 from companion.tracking.imm import Constants, birth, put, step
-from companion.tracking.tracks import BoolArray, IntArray, Keys, Rows, Sightings, Tracks
+from companion.tracking.tracks import BoolArray, IntArray, Rows, Sightings, Tracks
 from companion.types import NS_PER_S, FloatArray
 
 SPLIT_OUTSIDE = 5  # detections running
@@ -29,10 +29,11 @@ Column = TypeVar("Column", bound=npt.NDArray[np.generic])
 class Judgement:
     """What becomes of D measurements."""
 
-    skipped: BoolArray
-    restarted: BoolArray
-    leaving: BoolArray
+    skipped: BoolArray  # as an outlier
+    restarted: BoolArray  # the track, at the measurement
+    leaving: BoolArray  # the track, to begin another
     outside: IntArray  # running, of each key
+    clean: bool  # nothing of all this
 
 
 def advance(
@@ -53,20 +54,23 @@ def advance(
     placed = sightings if known.size == len(sightings) else sightings.take(known)
     tracks, key = with_anonymous_keys(tracks, placed, source, stamp_ns)
     full = placed.measurements.full
-    parts = [np.flatnonzero(full == part) for part in (False, True)] if full.any() else [np.arange(len(placed))]
-    left, used = [], []
-    for part in parts:
+    if full.any() and not full.all():
+        order = np.argsort(full, kind="stable")
+        placed, key, known = placed.take(order), key[order], known[order]
+    skipped, leaving = [], []
+    for part in np.split(np.arange(len(placed)), [len(placed) - int(full.sum())]):
         if part.size:
             chosen = placed if part.size == len(placed) else placed.take(part)
             tracks, judged = _filter(tracks, chosen, key[part], stamp_ns, config, constants, foreign)
-            counts["outlier"] += int(judged.skipped.sum())
-            left.append(part[judged.leaving])
-            used.append(placed.rows[part[~judged.skipped & ~judged.leaving]])
-    leaving = np.concatenate(left)
-    if leaving.size:
-        tracks = unbound(tracks, key[leaving])
-    fresh = np.sort(np.concatenate((np.flatnonzero(sightings.rows < 0), known[leaving])))
-    return tracks, sightings.take(fresh), np.concatenate(used)
+            skipped.append(judged.skipped)
+            leaving.append(judged.leaving)
+    fresh = sightings.rows < 0
+    unused, gone = np.concatenate(skipped), np.concatenate(leaving)
+    if gone.any():
+        tracks = unbound(tracks, key[gone])
+        fresh[known[gone]] = True
+    counts["outlier"] += int(unused.sum())
+    return tracks, sightings.take(np.flatnonzero(fresh)), placed.rows[~(unused | gone)]
 
 
 def _filter(
@@ -79,50 +83,43 @@ def _filter(
     foreign: bool,
 ) -> tuple[Tracks, Judgement]:
     """One step of the bank for measurements of one dimension."""
-    rows, full = found.rows, bool(found.measurements.full[0])
+    rows, measurements = found.rows, found.measurements
     everything = rows.tolist() == list(range(len(tracks)))  # as when a frame shows every track, the common case
     before = tracks.bank if everything else tracks.bank.take(rows)
     # a nanosecond stands for none, as between two sources of one stamp: no model may have probability zero
     dt = np.maximum(stamp_ns - tracks.stamp_ns[rows], 1) / NS_PER_S
-    z, noise = found.measurements.parts(full)
+    z, noise = measurements.parts(bool(measurements.full[0]))
     after, nis = step(before, dt, z, noise, constants, foreign=foreign)
     judged = _judge(tracks, rows, key, nis.min(axis=1), config)
-    if judged.restarted.any():
-        again = np.flatnonzero(judged.restarted)
-        after = put(after, again, birth(z[again], noise[again], constants))
-    radius_m, keys = found.measurements.radius_m, _noted(tracks.keys, key, judged, stamp_ns)
-    unused = judged.skipped | judged.leaving
-    if unused.any():
-        stays = np.flatnonzero(~unused)
-        rows, after, everything = rows[stays], after.take(stays), False
-        key, radius_m = key[stays], radius_m[stays]
+    radius_m, noted = measurements.radius_m, key
+    if not judged.clean:
+        again, used = np.flatnonzero(judged.restarted), np.flatnonzero(~(judged.skipped | judged.leaving))
+        after = put(after, again, birth(z[again], noise[again], constants)).take(used)
+        rows, radius_m, noted = rows[used], radius_m[used], key[used]
+        everything = False
+    keys = tracks.keys
+    keys = keys.with_columns(
+        seen_ns=_written(keys.seen_ns, key, stamp_ns),
+        radius_m=_written(keys.radius_m, noted, radius_m),
+        outlier=_written(keys.outlier, key, judged.skipped),
+        outside=_written(keys.outside, key, judged.outside),
+    )
     bank = after if everything else put(tracks.bank, rows, after)
-    stamps = _written(tracks.stamp_ns, rows, stamp_ns)
-    keys = replace(keys, radius_m=_written(keys.radius_m, key, radius_m))
-    return replace(tracks, bank=bank, stamp_ns=stamps, keys=keys), judged
+    return tracks.advanced(bank, _written(tracks.stamp_ns, rows, stamp_ns), keys), judged
 
 
 def _judge(tracks: Tracks, rows: Rows, key: Rows, nis: FloatArray, config: TrackingConfig) -> Judgement:
     """What becomes of measurements with the normalised innovations squared ``nis`` (D,) of the nearest model."""
-    keys = tracks.keys
-    off = nis > config.gate_sigma**2
-    far = nis > config.jump_sigma**2
-    outside = np.where(off, keys.outside[key] + 1, 0)
-    if not off.any() and not far.any():
-        return Judgement(far, far, far, outside)
+    keys, gate, jump = tracks.keys, config.gate_sigma**2, config.jump_sigma**2
+    if nis.max() <= min(gate, jump):
+        none = np.zeros(len(nis), dtype=np.bool_)
+        return Judgement(none, none, none, none.astype(np.int64), clean=True)
+    far = nis > jump
+    outside = np.where(nis > gate, keys.outside[key] + 1, 0)
     shared = tracks.keys_per_track()[rows] > 1
     again = far & keys.outlier[key]
     leaving = shared & (again | (outside >= SPLIT_OUTSIDE))
-    return Judgement(far & ~again & ~leaving, again & ~shared, leaving, outside)
-
-
-def _noted(keys: Keys, key: Rows, judged: Judgement, stamp_ns: int) -> Keys:
-    return replace(
-        keys,
-        seen_ns=_written(keys.seen_ns, key, stamp_ns),
-        outlier=_written(keys.outlier, key, judged.skipped),
-        outside=_written(keys.outside, key, judged.outside),
-    )
+    return Judgement(far & ~again & ~leaving, again & ~shared, leaving, outside, clean=False)
 
 
 def _written(column: Column, rows: Rows, values: Column | int) -> Column:

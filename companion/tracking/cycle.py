@@ -82,13 +82,16 @@ def _placed(
     stamp_ns = frame.stamp_ns
     sightings = sightings_by_key(found, tracks, suspects, stamp_ns, rules.config, counts)
     tracks, sightings = disagreeing_names(tracks, sightings)
-    if not in_question(tracks, sightings).size:  # every obstacle known by its name, the common case
+    named_only = found.named == len(found.names)
+    if named_only and not in_question(tracks, sightings).size:  # all known by their names, the common case
         return tracks, sightings, suspects
     own = path.at(stamp_ns)
-    if found.named < len(found.names):
+    if not named_only:
         evidence = suspects.get((frame.source, None))
         pseudo = own if evidence is not None and evidence.lives(stamp_ns) else None
         sightings = associated(tracks, sightings, stamp_ns, trusted, pseudo, rules.config, rules.constants)
+    if own is None and not suspects:
+        return tracks, sightings, suspects
     recognised = recognise(tracks, sightings, suspects, stamp_ns, own, rules.vehicle_radius_m)
     if recognised.own:
         counts["own_vehicle"] += recognised.own

@@ -56,20 +56,21 @@ def sightings_by_key(
     found: Found, tracks: Tracks, suspects: Suspects, stamp_ns: int, config: TrackingConfig, counts: Counter[str]
 ) -> Sightings:
     """Named detections with their tracks, less those seen before or older than their track; anonymous ones NEW."""
-    index, keys = tracks.keys.index, tracks.keys
-    key = np.array([index.get(name, -1) for name in found.names], dtype=np.intp)
+    keys = tracks.keys
+    key = np.array([keys.index.get(name, -1) for name in found.names], dtype=np.intp)
     rows = np.where(key >= 0, keys.row[key], NEW) if keys.names else key
     sightings = Sightings(found.names, measure(found.detections, config), rows, np.ones(len(key), dtype=np.int64))
-    known = key >= 0
-    again = known & (keys.seen_ns[key] == stamp_ns) if keys.names else known
-    if suspects:
-        again |= [name[1] is not None and _seen_at(suspects, name, stamp_ns) for name in found.names]
-    late = known & ~again & (tracks.stamp_ns[rows] > stamp_ns) if len(tracks) else known & ~known
-    if again.any() or late.any():
-        counts["duplicate"] += int(again.sum())
-        counts["late"] += int(late.sum())
-        return sightings.take(np.flatnonzero(~again & ~late))
-    return sightings
+    if not suspects and (not keys.names or keys.seen_ns.max() < stamp_ns):
+        return sightings  # newer than everything, the common case
+    known = rows >= 0
+    again = np.array([name[1] is not None and _seen_at(suspects, name, stamp_ns) for name in found.names])
+    late = np.zeros_like(known)
+    if known.any():
+        again |= known & (keys.seen_ns[key] == stamp_ns)
+        late = known & ~again & (tracks.stamp_ns[rows] > stamp_ns)
+    counts["duplicate"] += int(again.sum())
+    counts["late"] += int(late.sum())
+    return sightings.take(np.flatnonzero(~again & ~late))
 
 
 def _seen_at(suspects: Suspects, name: Key, stamp_ns: int) -> bool:
@@ -79,10 +80,11 @@ def _seen_at(suspects: Suspects, name: Key, stamp_ns: int) -> bool:
 
 def disagreeing_names(tracks: Tracks, sightings: Sightings) -> tuple[Tracks, Sightings]:
     """Two ids of one source on one track in one frame: two obstacles after all. The one seen last keeps the track."""
-    keys = tracks.keys
-    rows = sightings.rows
+    keys, rows = tracks.keys, sightings.rows
+    if len(keys.names) == len(tracks):
+        return tracks, sightings
     known = np.flatnonzero(rows >= 0)
-    if len(keys.names) == len(tracks) or np.unique(rows[known]).size == known.size:
+    if np.unique(rows[known]).size == known.size:
         return tracks, sightings
     seen = {int(n): int(keys.seen_ns[keys.index[sightings.names[n]]]) for n in known}
     keeper: dict[int, int] = {}

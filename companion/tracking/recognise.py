@@ -22,9 +22,10 @@ class Recognised:
 
 def in_question(tracks: Tracks, sightings: Sightings) -> Rows:
     """Sightings that may be the vehicle: births, and those of tracks born while its path was unknown."""
-    question = sightings.rows < 0
-    if tracks.unchecked.any():
-        question |= tracks.unchecked[sightings.rows] & (sightings.rows >= 0)
+    rows = sightings.rows
+    question = rows < 0
+    if len(tracks):
+        question |= tracks.unchecked[rows] & (rows >= 0)
     return np.flatnonzero(question)
 
 
@@ -38,8 +39,6 @@ def recognise(
         radius_m: of the vehicle.
     """
     question = in_question(tracks, sightings)
-    if not question.size:
-        return Recognised(tracks, sightings, suspects, 0)
     living = {name: evidence for name, evidence in suspects.items() if evidence.lives(stamp_ns)}
     if own is None:
         ours = [n for n in question.tolist() if sightings.names[n][1] is not None and sightings.names[n] in living]

@@ -45,6 +45,10 @@ class Keys:
     def take(self, chosen: Rows) -> Keys:
         return _keys(tuple([self.names[k] for k in chosen]), *(column[chosen] for column in self.columns()))
 
+    def with_columns(self, *, seen_ns: IntArray, radius_m: FloatArray, outlier: BoolArray, outside: IntArray) -> Keys:
+        """The same keys after a frame."""
+        return Keys(self.names, self.index, self.row, self.source, seen_ns, radius_m, outlier, outside)
+
     def columns(self) -> Columns:
         return self.row, self.source, self.seen_ns, self.radius_m, self.outlier, self.outside
 
@@ -84,10 +88,12 @@ class Tracks:
         return place
 
     def columns(self) -> Columns:
-        return (
-            *(self.stamp_ns, self.born_ns, self.home, self.hits, self.chances),
-            *(self.trusted, self.confirmed, self.unchecked),
-        )
+        who = self.stamp_ns, self.born_ns, self.home
+        return *who, self.hits, self.chances, self.trusted, self.confirmed, self.unchecked
+
+    def advanced(self, bank: Bank, stamp_ns: IntArray, keys: Keys) -> Tracks:
+        """The same tracks after a frame; many times faster than `dataclasses.replace`."""
+        return _tracks(self.ids, bank, (stamp_ns, *self.columns()[1:]), self.apart, keys)
 
     def radius_m(self) -> FloatArray:
         """(M,) the largest of the newest radii that each track's keys state."""
