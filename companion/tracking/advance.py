@@ -46,31 +46,37 @@ def advance(
     counts: Counter[str],
     *,
     foreign: bool,
-) -> tuple[Tracks, Sightings, Rows]:
-    """Tracks after the ``sightings`` that have a row; those that begin tracks; and the rows that were updated."""
-    known = np.flatnonzero(sightings.rows >= 0)
+) -> tuple[Tracks, Sightings | None, Rows]:
+    """Tracks after the ``sightings`` that have a row; those that begin tracks, if any; and the rows updated."""
+    placed, known = sightings, np.arange(len(sightings))
+    if (sightings.rows < 0).any():
+        known = np.flatnonzero(sightings.rows >= 0)
+        placed = sightings.take(known)
     if not known.size:
-        return tracks, sightings, known
-    placed = sightings if known.size == len(sightings) else sightings.take(known)
+        return tracks, sightings if len(sightings) else None, known
     tracks, key = with_anonymous_keys(tracks, placed, source, stamp_ns)
-    full = placed.measurements.full
-    if full.any() and not full.all():
-        order = np.argsort(full, kind="stable")
-        placed, key, known = placed.take(order), key[order], known[order]
-    skipped, leaving = [], []
-    for part in np.split(np.arange(len(placed)), [len(placed) - int(full.sum())]):
-        if part.size:
-            chosen = placed if part.size == len(placed) else placed.take(part)
-            tracks, judged = _filter(tracks, chosen, key[part], stamp_ns, config, constants, foreign)
-            skipped.append(judged.skipped)
-            leaving.append(judged.leaving)
-    fresh = sightings.rows < 0
-    unused, gone = np.concatenate(skipped), np.concatenate(leaving)
-    if gone.any():
-        tracks = unbound(tracks, key[gone])
-        fresh[known[gone]] = True
-    counts["outlier"] += int(unused.sum())
-    return tracks, sightings.take(np.flatnonzero(fresh)), placed.rows[~(unused | gone)]
+    parts = _parts(placed.measurements.full)
+    unused, leaving = np.zeros(known.size, dtype=np.bool_), np.zeros(known.size, dtype=np.bool_)
+    for part in parts:
+        chosen = placed if len(parts) == 1 else placed.take(part)
+        tracks, judged = _filter(tracks, chosen, key[part], stamp_ns, config, constants, foreign)
+        if not judged.clean:
+            unused[part], leaving[part] = judged.skipped | judged.leaving, judged.leaving
+            counts["outlier"] += int(judged.skipped.sum())
+    used = placed.rows[~unused]
+    if leaving.any():
+        tracks = unbound(tracks, key[leaving])
+    elif known.size == len(sightings):
+        return tracks, None, used
+    fresh = np.delete(np.arange(len(sightings)), known[~leaving])
+    return tracks, sightings.take(fresh), used
+
+
+def _parts(full: BoolArray) -> list[Rows]:
+    """The measurements of each dimension; the bank takes one dimension at a time."""
+    if full.all() or not full.any():
+        return [np.arange(full.size)]
+    return [np.flatnonzero(~full), np.flatnonzero(full)]
 
 
 def _filter(

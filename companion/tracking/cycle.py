@@ -51,7 +51,7 @@ def consume(picture: Picture, frame: DetectionFrame, rules: Rules, path: OwnPath
         tracks, fresh, used = advance(
             tracks, sightings, source.number, stamp_ns, config, rules.constants, counts, foreign=foreign
         )
-        if len(fresh):
+        if fresh is not None:
             origin = Origin(stamp_ns, source.number, trusted, unchecked=path.at(stamp_ns) is None)
             tracks, source = _begin(tracks, fresh, source, origin, rules)
         if found.named < len(found.names):
