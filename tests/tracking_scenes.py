@@ -24,6 +24,11 @@ def frame(t_s, *detections, source="cam", sequence=0, kind=DetectionKind.DETECTI
     return DetectionFrame(round(t_s * S), source, sequence, kind, tuple(detections))
 
 
+def beside(p, x=0.0, y=0.0, z=0.0):
+    """The place that is (x, y, z) from ``p``."""
+    return np.asarray(p) + np.array([x, y, z])
+
+
 def vehicle(t_s, p, v=(0.0, 0.0, 0.0), p_std_m=0.0):
     return VehicleState(round(t_s * S), frozen(p), frozen(v), p_std_m=p_std_m)
 

@@ -25,7 +25,7 @@ def in_question(tracks: Tracks, sightings: Sightings) -> Rows:
     rows = sightings.rows
     question = rows < 0
     if len(tracks):
-        question |= tracks.unchecked[rows] & (rows >= 0)
+        question |= tracks.unchecked[np.maximum(rows, 0)]  # of a birth it does not matter which
     return np.flatnonzero(question)
 
 

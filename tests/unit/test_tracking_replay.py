@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tracking_scenes import S, assert_same_bits, frame, give, seen
 
 from companion.config import TrackingConfig
 from companion.tracking import replay
@@ -11,7 +12,6 @@ from companion.tracking.imm import build_constants
 from companion.tracking.picture import empty_picture
 from companion.tracking.replay import REPLAY_FRAMES, Replay
 from companion.tracking.tracker import Tracker
-from tracking_scenes import S, assert_same_bits, frame, give, seen
 
 STEP_S = 0.025
 
@@ -26,7 +26,9 @@ def two_sources(seed, steps=18, *, dropout=0.25):
             if k % every or rng.random() < dropout:
                 continue
             z = p + v * STEP_S * k + rng.normal(scale=0.05, size=p.shape)
-            told = [seen(ids[m], z[m], v=v[m] if m == 3 else None, v_std=0.3) for m in range(4) if rng.random() > dropout]
+            told = [
+                seen(ids[m], z[m], v=v[m] if m == 3 else None, v_std=0.3) for m in range(4) if rng.random() > dropout
+            ]
             frames.append(frame(STEP_S * k, *told, source=source, sequence=k))
     return frames
 

@@ -4,12 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from tracking_scenes import S, frame, seen
 
 from companion.config import TrackingConfig
 from companion.tracking.reference import ReferenceImm
 from companion.tracking.tracker import Tracker
 from companion.types import DetectionFrame, DetectionKind
-from tracking_scenes import S, frame, seen
+
 
 def straight(k, rng, p=(0.0, 0.0, 2.0), v=(1.0, -0.5, 0.1), std=0.05):
     return np.array(p) + np.array(v) * 0.05 * k + rng.normal(scale=std, size=3)
