@@ -15,7 +15,7 @@ from companion.config import TrackingConfig
 from companion.tracking.advance import advance
 from companion.tracking.identity import Found, associated, disagreeing_names, sightings_by_key, usable
 from companion.tracking.imm import Constants
-from companion.tracking.lifecycle import bound, confirm, expire
+from companion.tracking.lifecycle import confirm, expire, make_room
 from companion.tracking.merge import merge_agreeing, tell_apart
 from companion.tracking.ownship import OwnPath, Suspects
 from companion.tracking.picture import Picture, Source, hear
@@ -44,27 +44,26 @@ def consume(picture: Picture, frame: DetectionFrame, rules: Rules, path: OwnPath
     tracks = expire(picture.tracks, stamp_ns - rules.coast_ns, counts, spare_trusted=not trusted)
     source, new_look = hear(picture.sources.get(frame.source), len(picture.sources), stamp_ns)
     found = usable(frame, source.anonymous_ns, counts)
-    suspects, used = picture.suspects, _NONE
+    suspects, fresh, used = picture.suspects, None, _NONE
     if found.names:
         tracks, sightings, suspects = _placed(tracks, suspects, found, frame, trusted, rules, path, counts)
         foreign = frame.kind is DetectionKind.TRACK
         tracks, fresh, used = advance(
             tracks, sightings, source.number, stamp_ns, config, rules.constants, counts, foreign=foreign
         )
-        if fresh is not None:
-            origin = Origin(stamp_ns, source.number, trusted, unchecked=path.at(stamp_ns) is None)
-            tracks, source = _begin(tracks, fresh, source, origin, rules)
         if found.named < len(found.names):
             source = replace(source, anonymous_ns=stamp_ns)
-    sources = {**picture.sources, frame.source: source}
     tracks = confirm(tracks, used, source.number, stamp_ns, config.confirm_hits, counts, new_look=new_look)
-    watch = picture.watch
+    if fresh is not None:
+        own = path.at(stamp_ns)
+        p_own = path.newest if own is None else own.p_enu
+        tracks, fresh = make_room(tracks, fresh, trusted, config.max_tracks, p_own, counts)
+        origin = Origin(stamp_ns, source.number, trusted, unchecked=own is None)
+        tracks, source = _begin(tracks, fresh, source, origin, rules)
+    sources, watch = {**picture.sources, frame.source: source}, picture.watch
     if len(sources) > 1 and config.merge_s > 0.0:
         tracks = tell_apart(tracks, source.number, stamp_ns)
         tracks, watch = merge_agreeing(tracks, watch, stamp_ns, config.merge_s, rules.constants)
-    if len(tracks) > config.max_tracks:
-        own = path.at(stamp_ns)
-        tracks = bound(tracks, config.max_tracks, path.newest if own is None else own.p_enu, counts)
     return Picture(tracks, sources, suspects, watch, counts)
 
 

@@ -117,8 +117,6 @@ def associated(
         own: the vehicle as a pseudo-track; None: it takes no part.
     """
     anonymous = np.flatnonzero([name[1] is None for name in sightings.names])
-    if not anonymous.size:
-        return sightings
     free = np.setdiff1d(np.flatnonzero((tracks.trusted == trusted) & (tracks.stamp_ns <= stamp_ns)), sightings.rows)
     dt = (stamp_ns - tracks.stamp_ns[free]) / NS_PER_S
     x, covariance = propagate(tracks.bank.x[free], tracks.bank.covariance[free], dt, constants.models)

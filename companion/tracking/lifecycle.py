@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.tracking.imm import fuse_mean
-from companion.tracking.tracks import BoolArray, Rows, Tracks
+from companion.tracking.tracks import BoolArray, Rows, Sightings, Tracks
 from companion.types import Vec3
 
 
@@ -56,17 +56,23 @@ def confirm(
     return _without(tracks, ~confirmed & (chances <= 0), counts, lost="unconfirmed")
 
 
-def bound(tracks: Tracks, most: int, p_own: Vec3 | None, counts: Counter[str]) -> Tracks:
-    """At most ``most`` tracks: trusted ones first, then those nearest to the vehicle, else the older."""
-    if len(tracks) <= most:
-        return tracks
-    distance = np.zeros(len(tracks))
-    if p_own is not None:
-        bank = tracks.bank
-        distance = np.linalg.norm(fuse_mean(bank.x, bank.probabilities)[:, :3] - p_own, axis=1)
-    order = np.lexsort((np.arange(len(tracks)), distance, ~tracks.trusted))
-    counts["over_max_tracks"] += len(tracks) - most
-    return tracks.take(np.sort(order[:most]))
+def make_room(
+    tracks: Tracks, births: Sightings, trusted: bool, most: int, p_own: Vec3 | None, counts: Counter[str]
+) -> tuple[Tracks, Sightings]:
+    """The tracks that stay and the births that get in, ``most`` together.
+
+    Trusted ones first, then those nearest to the vehicle at ``p_own``; where that is unknown, the older.
+    """
+    over = len(tracks) + len(births) - most
+    if over <= 0:
+        return tracks, births
+    p_enu = np.concatenate((fuse_mean(tracks.bank.x, tracks.bank.probabilities)[:, :3], births.measurements.z[:, :3]))
+    distance = np.zeros(len(p_enu)) if p_own is None else np.linalg.norm(p_enu - p_own, axis=1)
+    untrusted = np.append(~tracks.trusted, np.full(len(births), not trusted))
+    stay = np.sort(np.lexsort((np.arange(len(p_enu)), distance, untrusted))[:most])
+    counts["over_max_tracks"] += over
+    kept = stay[stay < len(tracks)]
+    return tracks.take(kept), births.take(stay[kept.size :] - len(tracks))
 
 
 def _without(tracks: Tracks, gone: BoolArray, counts: Counter[str], *, lost: str) -> Tracks:

@@ -26,9 +26,6 @@ class Measurements:
     full: np.ndarray  # (D,) bool
     radius_m: FloatArray  # (D,)
 
-    def __len__(self) -> int:
-        return len(self.z)
-
     def take(self, rows: np.ndarray) -> Measurements:
         return Measurements(self.z[rows], self.noise[rows], self.full[rows], self.radius_m[rows])
 

@@ -93,3 +93,26 @@ def test_the_bound_holds_with_late_frames_to_the_bit():
             give(tracker, each, now_s=0.4)
     assert_same_bits(one, other, S)
     assert one.dropped == other.dropped
+
+
+def test_the_time_of_an_untrusted_frame_ends_no_name_of_a_trusted_track():
+    tracker = Tracker(TrackingConfig(untrusted=("net",), merge_s=0.3, replay_s=0.0))
+    for k in range(20):
+        for source in ("cam", "radar"):
+            give(tracker, frame(STEP_S * k, seen("a", [0.0, 0.0, 1.0]), source=source, sequence=k))
+    for k in range(20, 30):
+        give(tracker, frame(STEP_S * k, seen("a", [0.0, 0.0, 1.0]), sequence=k))
+    give(tracker, frame(2.2, source="net"), now_s=1.45)
+    assert tracker.table().sources == (("cam", "radar"),)
+    give(tracker, frame(2.2, source="cam", sequence=99), now_s=1.45)
+    assert tracker.table().sources == (("cam",),)
+
+
+def test_a_full_table_still_updates_what_it_has_while_births_push_others_out():
+    """In one frame: a tentative track is confirmed, one is pushed out, a near one gets in."""
+    tracker = Tracker(TrackingConfig(max_tracks=2))
+    tracker.note_vehicle(vehicle(0.0, [0.0, 0.0, 1.0]))
+    give(tracker, frame(0.0, seen("far", [9.0, 0.0, 1.0]), seen(None, [3.0, 0.0, 1.0])))
+    give(tracker, frame(0.05, seen("far", [9.0, 0.0, 1.0]), seen(None, [3.0, 0.0, 1.0]), seen("near", [2.0] * 3)))
+    assert tracker.table().ids == ("cam/#1", "cam/near")
+    assert tracker.table().status == ("confirmed", "confirmed")

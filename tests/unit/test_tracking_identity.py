@@ -199,6 +199,16 @@ def test_anonymous_keys_of_one_source_are_one_after_a_merge():
     assert keys[-1] == [("cam", "a"), ("lidar", None), ("radar", "x")]
 
 
+def test_three_sources_that_agree_at_one_check_are_one():
+    tracker, counts = Tracker(TrackingConfig(merge_s=0.3)), set()
+    give(tracker, *(frame(0.0, source=name) for name in ("a", "b", "c")))  # the first check finds nothing
+    for k in range(1, 20):
+        give(tracker, *(frame(STEP_S * k, seen("o", at(k)), source=name, sequence=k) for name in ("a", "b", "c")))
+        counts.add(len(tracker))
+    assert tracker.table().sources == (("a", "b", "c"),)
+    assert counts == {3, 1}
+
+
 def merged(config=None):
     tracker = two_eyes(Tracker(config or TrackingConfig()), 0, 30)
     assert tracker.table().ids == ("cam/a",)

@@ -187,3 +187,14 @@ def test_what_was_counted_is_not_counted_again_by_a_rollback():
     assert tracker.dropped == {"outlier": 1, "duplicate": 11}
     tracker.reset()
     assert not tracker.dropped
+
+
+@pytest.mark.parametrize(("t_s", "reason"), [(0.1, "duplicate"), (0.05, "late")])
+def test_an_anonymous_frame_of_a_stamp_already_seen_changes_nothing(t_s, reason):
+    tracker = Tracker(TrackingConfig(replay_s=0.0))
+    give(tracker, frame(0.1, seen(None, [1.0, 0.0, 1.0]), sequence=1))
+    give(tracker, frame(t_s, seen(None, [5.0, 0.0, 1.0]), seen(None, [6.0, 0.0, 1.0]), sequence=2), now_s=0.1)
+    assert tracker.dropped == {reason: 2}
+    assert len(tracker) == 1
+    give(tracker, frame(t_s, seen(None, [5.0, 0.0, 1.0]), source="other"), now_s=0.1)
+    assert len(tracker) == 2, "another source of that stamp is used"
