@@ -98,7 +98,12 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     inflation_max: Annotated[float, Meta(ge=1.0, le=100.0)] = 10.0  # most that this widens its predictions; 1: never
     gate_sigma: Positive = 4.0
     coast_s: Positive = 1.0  # a track without measurement is dropped after this
-    max_tracks: Annotated[int, Meta(ge=1, le=1024)] = 128
+    max_tracks: Annotated[int, Meta(ge=1, le=1024)] = 128  # trusted ones first, then the nearest to the vehicle
+    replay_s: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.5  # a frame this late is still used at its own stamp; 0: off
+    confirm_hits: Annotated[int, Meta(ge=1, le=20)] = 2  # detections that confirm an anonymous track; 1: at once
+    confirm_frames: Annotated[int, Meta(ge=1, le=100)] = 3  # of its source after the first in which they must come
+    merge_s: Annotated[float, Meta(ge=0.0, le=60.0)] = 1.0  # tracks that agree for this long become one; 0: never
+    untrusted: tuple[Name, ...] = ()  # sources that may add obstacles but never move or end those of others
 
 
 class PolicyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

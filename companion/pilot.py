@@ -80,7 +80,7 @@ class Pilot:
     def __init__(self, config: Config, policy: Policy | None = None) -> None:
         self._config = config
         self._policy = load_policy(config.policy, config.limits) if policy is None else policy
-        self._tracker = Tracker(config.tracking)
+        self._tracker = Tracker(config.tracking, config.safety.drone_radius_m)
         self._filter = SafetyFilter(config.safety, config.limits)
         self._observer = DisturbanceObserver(config.disturbance, lag_s=config.actuation_s)
         self._delay_ns = round((config.delay.loop_s + config.actuation_s) * NS_PER_S)
@@ -102,6 +102,11 @@ class Pilot:
         """The tracks as the last step left them; apart from it, because nobody waits for them."""
         return self._tracker.table()
 
+    @property
+    def tracking_counts(self) -> dict[str, int]:
+        """Detections not used and tracks ended, by reason."""
+        return dict(self._tracker.dropped)
+
     def observe(self, frames: tuple[DetectionFrame, ...], stamp_ns: int) -> None:
         """Track and predict for the tick of ``stamp_ns`` before its vehicle state is there.
 
@@ -122,6 +127,7 @@ class Pilot:
         ahead, self._ahead = self._ahead, None
         prepared = ahead is not None and ahead[0] == vehicle.stamp_ns
         prediction = ahead[1] if ahead and prepared else self._track(inputs.frames, vehicle.stamp_ns)
+        self._tracker.note_vehicle(vehicle)  # behind the tracking of this tick, which may have been done ahead
         p_act, v_act = self._at_action(vehicle)
         u_ref, valid = self._reference(inputs, p_act, v_act)
         flying = inputs.task is not Task.STAY
@@ -148,6 +154,7 @@ class Pilot:
         """Filter a reference of your own (net, ENU [m/s^2]) instead of the policy's: the library's front door."""
         elapsed_s = self._elapsed(vehicle)
         prediction = self._track(frames, vehicle.stamp_ns)
+        self._tracker.note_vehicle(vehicle)
         p_act, v_act = self._at_action(vehicle)
         result = self._filtered(vehicle, p_act, v_act, frozen(a_ref), prediction, True, elapsed_s)
         self._commands.append((prediction.start_ns, result.a_safe))

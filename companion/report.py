@@ -66,6 +66,8 @@ def tracks_out(output: PilotOutput, table: TrackTable) -> TracksOut:
         table.radius_m.tolist(),
         covariances,
         table.mode_probabilities.tolist(),
+        table.status,
+        table.sources,
         strict=True,
     )
     return TracksOut(
@@ -80,8 +82,10 @@ def tracks_out(output: PilotOutput, table: TrackTable) -> TracksOut:
                 covariance=covariance,
                 mode_probabilities=tuple(mu),
                 predicted=[tuple(q) for q in predicted.get(name, [])],
+                status=status,
+                sources=list(sources),
             )
-            for name, p, v, a, radius, covariance, mu in rows
+            for name, p, v, a, radius, covariance, mu, status, sources in rows
         ],
     )
 

@@ -283,6 +283,7 @@ class Service:
         return {
             **{f"verdict.{name}": count for name, count in sorted(meter.verdicts.items())},
             **{f"obstacles.{name}": count for name, count in sorted(self._inbox.counts.items())},
+            **{f"tracking.{name}": count for name, count in sorted(self._thinker.tracking_counts.items())},
             **{f"mavlink.{name}": count for name, count in sorted(self._codec.counts.items())},
             "deadline_misses": meter.deadline_misses,
             "states_skipped": meter.states_skipped,

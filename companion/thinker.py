@@ -56,6 +56,10 @@ class Thinker:
     def tracks(self) -> TrackTable:
         return self._pilot.tracks()
 
+    @property
+    def tracking_counts(self) -> dict[str, int]:
+        return self._pilot.tracking_counts
+
     def observe_ahead(self, after_ns: int, now_ns: int) -> None:
         """In lockstep: the next tick's obstacles may be here before its vehicle state; track them meanwhile."""
         tick_ns = self._inbox.complete_through_ns(self._config.lockstep_sources)

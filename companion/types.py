@@ -87,7 +87,7 @@ class TrackTable:
     """All tracks at one instant, batched: M tracks, three models (CV, CA, CT), common state [p, v, a]."""
 
     stamp_ns: int
-    ids: tuple[str, ...]  # "source/id", or "source/#n" for a track born from anonymous detections
+    ids: tuple[str, ...]  # "source/id", "source/#n" if born from anonymous detections, "~2" behind it if that is taken
     p_enu: FloatArray  # (M, 3) [m]
     v_enu: FloatArray  # (M, 3) [m/s]
     a_enu: FloatArray  # (M, 3) [m/s^2]
@@ -95,6 +95,8 @@ class TrackTable:
     mode_probabilities: FloatArray  # (M, 3)
     radius_m: FloatArray  # (M,)
     age_s: FloatArray  # (M,) time since the last update of each
+    status: tuple[str, ...]  # "tentative", "confirmed", "coasting": the newest frame of none of its sources showed it
+    sources: tuple[tuple[str, ...], ...]  # names of the sources that see each, sorted
 
     def __len__(self) -> int:
         return len(self.ids)

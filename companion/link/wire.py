@@ -136,7 +136,9 @@ class TrackOut(Struct, frozen=True, kw_only=True):
     radius: float
     covariance: list[float]  # upper triangle of 6x6 over (position, velocity)
     mode_probabilities: tuple[float, float, float]  # CV, CA, CT
-    predicted: list[Vec]  # on the barrier grid, from the instant at which the setpoint acts
+    predicted: list[Vec]  # on the barrier grid, from the instant at which the setpoint acts; empty for a tentative one
+    status: str  # "tentative", "confirmed", "coasting"
+    sources: list[str]  # that see it
 
 
 class TracksOut(Struct, frozen=True, kw_only=True):

@@ -27,8 +27,8 @@ class Engine(Protocol):
     ) -> tuple[imm.Bank, FloatArray]:
         """`imm.step`."""
 
-    def propagate(self, bank: imm.Bank, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States and covariances of all models, each track ``dt`` (M,) [s] on."""
+    def propagate(self, x: FloatArray, covariance: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """`models.propagate`."""
 
     def predict(
         self, x: FloatArray, covariance: FloatArray, probabilities: FloatArray, at: predict.Horizon
@@ -55,14 +55,13 @@ class BatchedEngine:
                 whole[rows] = part
         return after, nis
 
-    def propagate(self, bank: imm.Bank, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if len(bank) <= BLOCK:
-            return propagate(bank.x, bank.covariance, dt, self.constants.models)
-        x, covariance = np.empty_like(bank.x), np.empty_like(bank.covariance)
-        for rows in _blocks(len(bank)):
-            carried = propagate(bank.x[rows], bank.covariance[rows], dt[rows], self.constants.models)
-            x[rows], covariance[rows] = carried
-        return x, covariance
+    def propagate(self, x: FloatArray, covariance: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if len(x) <= BLOCK:
+            return propagate(x, covariance, dt, self.constants.models)
+        moved, spread = np.empty_like(x), np.empty_like(covariance)
+        for rows in _blocks(len(x)):
+            moved[rows], spread[rows] = propagate(x[rows], covariance[rows], dt[rows], self.constants.models)
+        return moved, spread
 
     def predict(
         self, x: FloatArray, covariance: FloatArray, probabilities: FloatArray, at: predict.Horizon

@@ -26,9 +26,6 @@ class Measurements:
     full: np.ndarray  # (D,) bool
     radius_m: FloatArray  # (D,)
 
-    def __len__(self) -> int:
-        return len(self.z)
-
     def take(self, rows: np.ndarray) -> Measurements:
         return Measurements(self.z[rows], self.noise[rows], self.full[rows], self.radius_m[rows])
 
@@ -39,12 +36,13 @@ class Measurements:
 
 def is_finite(detection: Detection) -> bool:
     """Whether every number of ``detection`` is finite; the wire checks this too, a library user may not."""
-    numbers = [*detection.p_enu.tolist(), detection.radius_m, detection.p_std_m or 0.0, detection.v_std_m_s or 0.0]
+    x, y, z = detection.p_enu.tolist()
+    total = x + y + z + detection.radius_m + (detection.p_std_m or 0.0) + (detection.v_std_m_s or 0.0)
     if detection.v_enu is not None:
-        numbers += detection.v_enu.tolist()
+        total += sum(detection.v_enu.tolist())
     if detection.covariance is not None:
-        numbers += detection.covariance.ravel().tolist()
-    return all(map(math.isfinite, numbers))
+        total += sum(detection.covariance.ravel().tolist())
+    return math.isfinite(total)  # one that is not makes the sum so, and finite ones as large do not fly
 
 
 def measure(detections: Sequence[Detection], config: TrackingConfig) -> Measurements:

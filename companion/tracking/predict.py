@@ -73,7 +73,7 @@ class Horizon:
     L = 1 where all tracks share their instants, else L = M.
     """
 
-    tau_s: FloatArray  # (L, K) after the state, >= 0
+    tau_s: FloatArray  # (L, K) after the state
     reach: FloatArray  # (L, 3, K): what position, velocity and acceleration contribute, 1, tau, phi
     noise: FloatArray  # (L, 3, K): position variance of each model's own noise [m^2]
     turn_noise: FloatArray  # (L, K): q tau / 5, the turn rate's wandering as a variance of its constant error
@@ -86,21 +86,22 @@ class Horizon:
 
 
 def horizon(tau_s: FloatArray, models: MotionModels) -> Horizon:
-    """Constants of the instants ``tau_s``, (K,) for all tracks or (M, K).
+    """Constants of the instants ``tau_s``, (K,) for all tracks or (M, K); going back in time adds no noise.
 
     An acceleration with a memory T = 1 / alpha dies out as it is carried on: it moves the obstacle by
     phi(tau) = (alpha tau - 1 + e^(-alpha tau)) / alpha^2, tau^2 / 2 where alpha is zero, and white jerk of density q
     leaves q times the integral of phi^2.
     """
     tau_s = np.atleast_2d(tau_s)
-    noise = models.prediction_noise @ (tau_s[:, None] ** np.arange(6.0)[:, None])
+    ahead_s = np.maximum(tau_s, 0.0)
+    noise = models.prediction_noise @ (ahead_s[:, None] ** np.arange(6.0)[:, None])
     alpha = models.accel_decay_hz
     phi = acceleration_response(tau_s, alpha)[0]
     if alpha > 0.0:
-        aged, left = alpha * tau_s, np.exp(-alpha * tau_s)
+        aged, left = alpha * ahead_s, np.exp(-alpha * ahead_s)
         squared = (((aged - 1.0) ** 3 + 1.0) / 3.0 - 2.0 * aged * left + 0.5 * (1.0 - left * left)) / alpha**5
         noise[:, CA] = models.jerk_psd * squared
-    return Horizon(tau_s, np.stack((np.ones_like(tau_s), tau_s, phi), axis=1), noise, 0.2 * models.turn_psd * tau_s)
+    return Horizon(tau_s, np.stack((np.ones_like(tau_s), tau_s, phi), axis=1), noise, 0.2 * models.turn_psd * ahead_s)
 
 
 def predict_positions(

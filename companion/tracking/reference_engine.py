@@ -45,12 +45,13 @@ class ReferenceEngine:
             self._look_back(track, after, row, float(dt[row]), z[row, :3], noise[row, :3, :3])
         return after, nis
 
-    def propagate(self, bank: Bank, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
-        x, covariance = np.zeros_like(bank.x), np.zeros_like(bank.covariance)
-        for row in range(len(bank)):
-            for model, state in enumerate(self._unpack(bank, row).carried(float(dt[row]))):
-                x[row, model, SLOTS[model]], covariance[row, model][np.ix_(SLOTS[model], SLOTS[model])] = state
-        return x, covariance
+    def propagate(self, x: FloatArray, covariance: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
+        moved, spread = np.zeros_like(x), np.zeros_like(covariance)
+        for row in range(len(x)):
+            track = self._load(x[row], covariance[row], np.full(3, 1.0 / 3.0))
+            for model, state in enumerate(track.carried(float(dt[row]))):
+                moved[row, model, SLOTS[model]], spread[row, model][np.ix_(SLOTS[model], SLOTS[model])] = state
+        return moved, spread
 
     def predict(
         self, x: FloatArray, covariance: FloatArray, probabilities: FloatArray, at: Horizon

@@ -28,6 +28,7 @@ from companion.types import (
     FilterResult,
     FloatArray,
     Vec3,
+    VehicleState,
     Verdict,
     frozen,
 )
@@ -101,7 +102,7 @@ class _Loop:
 
     def __init__(self, config: Config, reference: Reference, encounter: Encounter, sensor: Sensor) -> None:
         self._config, self._reference, self._encounter, self._sensor = config, reference, encounter, sensor
-        self._tracker = Tracker(config.tracking)
+        self._tracker = Tracker(config.tracking, config.safety.drone_radius_m)
         self._filter = SafetyFilter(config.safety, config.limits)
         self._noise = np.random.default_rng([encounter.seed, 1])
         self._delay_ticks = round(config.actuation_s / TICK_S)
@@ -117,6 +118,7 @@ class _Loop:
         if config.safety.filter == "none":
             return a_ref, None
         self._tracker.update(tuple(self._frames(step, obstacles)), now_ns)
+        self._tracker.note_vehicle(VehicleState(now_ns, frozen(p), frozen(v)))
         p_act, v_act = p, v
         for a in list(self._commands)[-self._delay_ticks :] if self._delay_ticks else []:
             p_act = p_act + v_act * TICK_S + a * (0.5 * TICK_S * TICK_S)

@@ -44,6 +44,10 @@ class Failing:
     def tracks(self) -> Any:
         return self._pilot.tracks()
 
+    @property
+    def tracking_counts(self) -> dict[str, int]:
+        return self._pilot.tracking_counts
+
     def observe(self, frames: Any, stamp_ns: int) -> None:
         self._pilot.observe(frames, stamp_ns)
 

@@ -234,3 +234,46 @@ def test_observing_for_another_tick_is_not_used() -> None:
     output = brain.step(PilotInput(vehicle(8, [0, 0, 2]), (ball(8, [6, 0, 2]),)))
     assert output.prediction.ids == ("radar/ball",)
     assert output.prediction.start_ns >= 8 * TICK_NS
+
+
+def own_sight(k: int, p: list[float], name: str | None) -> DetectionFrame:
+    """The vehicle as its own sensor sees it, 0.1 m off."""
+    seen = Detection(name, frozen([p[0] + 0.1 * (-1) ** k, p[1], p[2]]), 0.2, p_std_m=0.1)
+    return DetectionFrame(k * TICK_NS, "cam", k, DetectionKind.DETECTION, (seen,))
+
+
+@pytest.mark.parametrize("name", ["uav1", None])
+def test_the_vehicle_reported_as_an_obstacle_does_not_disturb_its_flight(name: str | None) -> None:
+    brain = pilot(Straight([1.0, 0.5, 0.0]))
+    p, v = np.array([0.0, 0.0, 2.0]), np.zeros(3)
+    for k in range(60):
+        frames = (own_sight(k, p.tolist(), name),)
+        output = brain.step(PilotInput(vehicle(k, p.tolist(), v.tolist()), frames, Task.FLY, frozen([9, 9, 2])))
+        if k > 0:  # before the first tick nobody knows where the vehicle is
+            assert output.result.verdict is Verdict.NOMINAL
+            assert output.result.a_safe.tobytes() == output.u_ref.tobytes()
+        p, v = p + v * 0.05, v + output.wire * 0.05
+    assert brain.tracking_counts == {"own_vehicle": 59}
+    brain.reset()
+    assert brain.tracking_counts == {}
+
+
+def test_the_own_vehicle_is_recognised_at_the_library_door_too() -> None:
+    brain = pilot(Straight([0.0, 0.0, 0.0]))
+    for k in range(5):
+        result = brain.filter_acceleration(vehicle(k, [0, 0, 2]), frozen([0.5, 0, 0]), (own_sight(k, [0, 0, 2], "me"),))
+    assert result.verdict is Verdict.NOMINAL
+    assert brain.tracking_counts == {"own_vehicle": 4}
+
+
+def test_observing_ahead_recognises_the_vehicle_to_the_same_bit() -> None:
+    plain, ahead = pilot(Straight([1.0, 0.0, 0.0])), pilot(Straight([1.0, 0.0, 0.0]))
+    for k in range(40):
+        p = [0.02 * k, 0.0, 2.0]
+        frames = (ball(k, [6.0, 0.02 * k, 2.0]), own_sight(k, p, None))
+        inputs = PilotInput(vehicle(k, p, [0.4, 0, 0]), frames, Task.FLY, frozen([9, 0, 2]))
+        expected = plain.step(inputs)
+        ahead.observe(frames, k * TICK_NS)
+        assert ahead.step(inputs).wire.tobytes() == expected.wire.tobytes()
+        assert ahead.tracks().covariance.tobytes() == plain.tracks().covariance.tobytes()
+    assert ahead.tracking_counts == plain.tracking_counts == {"own_vehicle": 39}

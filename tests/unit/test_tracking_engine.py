@@ -52,7 +52,11 @@ def test_both_engines_agree_in_everything_they_return(name):
             np.testing.assert_allclose(part, whole, rtol=1e-9, atol=1e-9)
         if k % 10 == 0:
             for back in (np.array([0.0, 0.07, -0.05]), np.full(3, 0.05)):
-                for part, whole in zip(batched.propagate(one, back), plain.propagate(one, back), strict=True):
+                for part, whole in zip(
+                    batched.propagate(one.x, one.covariance, back),
+                    plain.propagate(one.x, one.covariance, back),
+                    strict=True,
+                ):
                     np.testing.assert_allclose(part, whole, atol=1e-9)
             ours = batched.predict(one.x, one.covariance, one.probabilities, at)
             theirs = plain.predict(one.x, one.covariance, one.probabilities, at)
@@ -74,7 +78,7 @@ def test_blocks_change_no_bit(monkeypatch):
         bank = birth(p[0], noise, batched.constants)
         for k in range(1, 12):
             bank, nis = batched.step(bank, np.full(300, 0.05), p[k], noise)
-        x, covariance = batched.propagate(bank, np.full(300, 0.02))
+        x, covariance = batched.propagate(bank.x, bank.covariance, np.full(300, 0.02))
         at = horizon(np.arange(5.0) * 0.05, batched.constants.models)
         results.append((*bank.parts(), nis, x, covariance, *batched.predict(x, covariance, bank.probabilities, at)))
     for other in results[1:]:

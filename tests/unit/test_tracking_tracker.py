@@ -4,29 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from tracking_scenes import S, frame, seen
 
 from companion.config import TrackingConfig
 from companion.tracking.reference import ReferenceImm
 from companion.tracking.tracker import Tracker
-from companion.types import Detection, DetectionFrame, DetectionKind, frozen
-
-S = 1_000_000_000
-
-
-def seen(identity, p, *, std=0.05, radius=0.2, v=None, v_std=None, covariance=None):
-    return Detection(
-        id=identity,
-        p_enu=frozen(p),
-        radius_m=radius,
-        p_std_m=std,
-        v_enu=None if v is None else frozen(v),
-        v_std_m_s=v_std,
-        covariance=None if covariance is None else frozen(covariance),
-    )
-
-
-def frame(t_s, *detections, source="cam", sequence=0, kind=DetectionKind.DETECTION):
-    return DetectionFrame(round(t_s * S), source, sequence, kind, tuple(detections))
+from companion.types import DetectionFrame, DetectionKind
 
 
 def straight(k, rng, p=(0.0, 0.0, 2.0), v=(1.0, -0.5, 0.1), std=0.05):
@@ -95,16 +78,27 @@ def test_frames_are_used_in_the_order_of_their_stamps():
     assert not one.dropped
 
 
-def test_late_and_repeated_stamps_are_counted_and_change_nothing():
+def test_repeated_stamps_are_counted_and_change_nothing():
     tracker = fly(Tracker(TrackingConfig()), 10)
+    before = tracker.table()
+    for sequence, t_s in ((97, 0.3), (98, 0.45), (99, 0.45)):
+        tracker.update([frame(t_s, seen("a", [9.0, 9.0, 9.0]), sequence=sequence)], round(0.45 * S))
+    assert tracker.dropped == {"duplicate": 3}
+    assert np.array_equal(tracker.table().p_enu, before.p_enu)
+    tracker.update([frame(0.5, seen("a", straight(10, np.random.default_rng(5))), seen("a", [9.0] * 3))], S // 2)
+    assert tracker.dropped["duplicate"] == 4
+    assert len(tracker) == 1
+
+
+def test_without_a_replay_what_is_older_than_its_track_is_late():
+    tracker = fly(Tracker(TrackingConfig(replay_s=0.0)), 10)
     before = tracker.table()
     tracker.update([frame(0.3, seen("a", [9.0, 9.0, 9.0]))], round(0.45 * S))
     tracker.update([frame(0.45, seen("a", [9.0, 9.0, 9.0]), sequence=99)], round(0.45 * S))
     assert tracker.dropped == {"late": 1, "duplicate": 1}
     assert np.array_equal(tracker.table().p_enu, before.p_enu)
-    tracker.update([frame(0.5, seen("a", straight(10, np.random.default_rng(5))), seen("a", [9.0] * 3))], S // 2)
-    assert tracker.dropped["duplicate"] == 2
-    assert len(tracker) == 1
+    tracker.update([frame(0.4, seen("b", [3.0, 3.0, 3.0]), source="slow")], round(0.45 * S))
+    assert tracker.table().ids == ("cam/a", "slow/b"), "a slower source is not late for its own tracks"
 
 
 def test_a_track_coasts_with_growing_covariance_and_then_ends():

@@ -1,0 +1,85 @@
+"""How tracks are confirmed and how they end: silence, chances used up, no room.
+
+Each function returns the tracks that stay and adds what ended to ``counts``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from companion.tracking.imm import fuse_mean
+from companion.tracking.tracks import BoolArray, Rows, Sightings, Tracks
+from companion.types import Vec3
+
+
+def expire(tracks: Tracks, oldest_ns: int, counts: Counter[str], *, spare_trusted: bool = False) -> Tracks:
+    """Without the tracks whose last measurement, and the keys whose last detection, is before ``oldest_ns``.
+
+    A key ends alone while others keep its track: an id seen again much later may be another obstacle.
+
+    Args:
+        spare_trusted: the frame that brings the time is of an untrusted source; it ends no trusted track.
+    """
+    if len(tracks) and tracks.stamp_ns.min() < oldest_ns:
+        gone = tracks.stamp_ns < oldest_ns
+        if spare_trusted:
+            gone &= ~tracks.trusted
+        tracks = _without(tracks, gone, counts, lost="lost")
+    keys = tracks.keys
+    if len(keys.names) > len(tracks) and keys.seen_ns.min() < oldest_ns:
+        fresh = keys.seen_ns >= oldest_ns
+        if spare_trusted:
+            fresh |= tracks.trusted[keys.row]
+        tracks = replace(tracks, keys=keys.take(np.flatnonzero(fresh)))
+    return tracks
+
+
+def confirm(
+    tracks: Tracks, used: Rows, source: int, stamp_ns: int, confirm_hits: int, counts: Counter[str], *, new_look: bool
+) -> Tracks:
+    """Tentative tracks after a frame of ``source``: hits of those ``used``, and a chance less for its own.
+
+    Args:
+        new_look: the frame is the first of its source with this stamp; only then it takes a chance.
+    """
+    if tracks.confirmed.all():
+        return tracks
+    hits, chances = tracks.hits.copy(), tracks.chances.copy()
+    hits[used] += 1
+    confirmed = tracks.confirmed | (hits >= confirm_hits)
+    if new_look:
+        chances[(tracks.home == source) & (tracks.born_ns < stamp_ns)] -= 1
+    tracks = replace(tracks, hits=hits, chances=chances, confirmed=confirmed)
+    return _without(tracks, ~confirmed & (chances <= 0), counts, lost="unconfirmed")
+
+
+def make_room(
+    tracks: Tracks, births: Sightings, trusted: bool, most: int, p_own: Vec3 | None, counts: Counter[str]
+) -> tuple[Tracks, Sightings]:
+    """The tracks that stay and the births that get in, ``most`` together.
+
+    Trusted ones first, then those nearest to the vehicle at ``p_own``; where that is unknown, the older.
+    """
+    over = len(tracks) + len(births) - most
+    if over <= 0:
+        return tracks, births
+    p_enu = np.concatenate((fuse_mean(tracks.bank.x, tracks.bank.probabilities)[:, :3], births.measurements.z[:, :3]))
+    distance = np.zeros(len(p_enu)) if p_own is None else np.linalg.norm(p_enu - p_own, axis=1)
+    untrusted = np.append(~tracks.trusted, np.full(len(births), not trusted))
+    stay = np.sort(np.lexsort((np.arange(len(p_enu)), distance, untrusted))[:most])
+    counts["over_max_tracks"] += over
+    kept = stay[stay < len(tracks)]
+    return tracks.take(kept), births.take(stay[kept.size :] - len(tracks))
+
+
+def _without(tracks: Tracks, gone: BoolArray, counts: Counter[str], *, lost: str) -> Tracks:
+    """Tracks less those ``gone``, counted as ``lost``, a tentative one as unconfirmed."""
+    if not gone.any():
+        return tracks
+    tentative = int((gone & ~tracks.confirmed).sum())
+    counts["unconfirmed"] += tentative
+    counts[lost] += int(gone.sum()) - tentative
+    return tracks.take(np.flatnonzero(~gone))
