@@ -1,8 +1,10 @@
 """Ten anonymous obstacles whose paths cross for a minute, with clutter: who is lost, who is taken for another.
 
-Every frame is a set of positions without names. Per tick the tracks are matched to the truth (least total distance,
-at most `MATCH_M`); an obstacle without a track counts as lost for that tick, one whose track has another id than the
-last time it had one counts as a swap.
+Every frame is a set of positions without names. Counted as in the CLEAR MOT metrics: an obstacle keeps the track that
+it had while that is within `MATCH_M` of it; the others are matched to the tracks left over (least total distance). One
+without a track counts as lost for that tick, one whose track has another id than its last counts as a swap.
+
+Source: Bernardin and Stiefelhagen, "Evaluating multiple object tracking performance", 2008.
 """
 
 from __future__ import annotations
@@ -99,14 +101,27 @@ def judge(crossing: Crossing, track_frame: TrackFrame) -> CrossingResult:
             continue
         ticks += 1
         distance = np.linalg.norm(truth[:, None] - p[None], axis=-1) if len(ids) else np.zeros((OBSTACLES, 0))
-        rows, columns = linear_sum_assignment(np.minimum(distance, MATCH_M))
-        matched = [(r, c) for r, c in zip(rows.tolist(), columns.tolist(), strict=True) if distance[r, c] < MATCH_M]
+        matched = _matched(distance, ids, carried)
         lost += OBSTACLES - len(matched)
         false += len(ids) - len(matched)
-        for obstacle, row in matched:
+        for obstacle, row in matched.items():
             swaps += carried.get(obstacle, ids[row]) != ids[row]
             carried[obstacle] = ids[row]
     return CrossingResult(swaps, lost / (ticks * OBSTACLES), false / ticks)
+
+
+def _matched(distance: FloatArray, ids: list[str], carried: dict[int, str]) -> dict[int, int]:
+    """Row of the track of each obstacle that has one."""
+    row_of = {name: row for row, name in enumerate(ids)}
+    kept = {obstacle: row_of[name] for obstacle, name in carried.items() if name in row_of}
+    matched = {obstacle: row for obstacle, row in kept.items() if distance[obstacle, row] < MATCH_M}
+    others = np.array([o for o in range(len(distance)) if o not in matched], dtype=np.intp)
+    free = np.array([row for row in range(len(ids)) if row not in matched.values()], dtype=np.intp)
+    left = np.minimum(distance[np.ix_(others, free)], MATCH_M)
+    for o, f in zip(*linear_sum_assignment(left), strict=True):
+        if left[o, f] < MATCH_M:
+            matched[int(others[o])] = int(free[f])
+    return matched
 
 
 def with_tracker(config: TrackingConfig) -> TrackFrame:

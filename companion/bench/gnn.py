@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.bench.rivals import FilterpyImm, SingleModel
 from companion.config import TrackingConfig
-from companion.tracking.associate import associate
+from companion.tracking.associate import Candidates, associate
 from companion.types import FloatArray
 
 
@@ -88,10 +88,11 @@ class GnnTracker:
             track.filter.predict(self._dt_s)
             track.missed += 1
         states = [track.filter.position() for track in self._tracks]
-        p = np.array([p for p, _ in states]).reshape(-1, 3)
-        spread = np.array([s for _, s in states]).reshape(-1, 3, 3)
+        p = np.array([p for p, _ in states]).reshape(-1, 1, 3)
+        spread = np.array([s for _, s in states]).reshape(-1, 1, 3, 3)
+        candidates = Candidates(p, spread, np.ones((len(p), 1)))
         noise = np.broadcast_to(self._noise, (len(z), 3, 3))
-        for detection, row in enumerate(associate(z, noise, p, spread, self._config.gate_sigma).tolist()):
+        for detection, row in enumerate(associate(z, noise, candidates, self._config.gate_sigma).tolist()):
             if row < 0:
                 self._born += 1
                 self._tracks.append(_Track(f"#{self._born}", self._make(z[detection]), born=k))

@@ -41,7 +41,7 @@ def consume(picture: Picture, frame: DetectionFrame, rules: Rules, path: OwnPath
     config, stamp_ns = rules.config, frame.stamp_ns
     trusted = frame.source not in config.untrusted
     counts = picture.counts.copy()
-    tracks = expire(picture.tracks, stamp_ns - rules.coast_ns, counts, spare_trusted=not trusted)
+    tracks = expire(picture.tracks, stamp_ns, rules.coast_ns, counts, spare_trusted=not trusted)
     source, new_look = hear(picture.sources.get(frame.source), len(picture.sources), stamp_ns)
     found = usable(frame, source.anonymous_ns, counts)
     suspects, fresh, used = picture.suspects, None, _NONE

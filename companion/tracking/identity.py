@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.config import TrackingConfig
-from companion.tracking.associate import associate
+from companion.tracking.associate import Candidates, associate
 from companion.tracking.engine import Engine
-from companion.tracking.imm import fuse
 from companion.tracking.measurement import is_finite, measure
 from companion.tracking.ownship import Fix, Suspects
 from companion.tracking.tracks import NEW, OURSELVES, Key, Rows, Sightings, Tracks, first_keys, join_keys
@@ -113,25 +112,43 @@ def associated(
 ) -> Sightings:
     """Anonymous sightings with their tracks: of the same trust, and not named by the frame itself.
 
+    Confirmed tracks choose first, so that one born of clutter takes no detection from them.
+
     Args:
         own: the vehicle as a pseudo-track; None: it takes no part.
     """
     anonymous = np.flatnonzero([name[1] is None for name in sightings.names])
     free = np.setdiff1d(np.flatnonzero((tracks.trusted == trusted) & (tracks.stamp_ns <= stamp_ns)), sightings.rows)
-    dt = (stamp_ns - tracks.stamp_ns[free]) / NS_PER_S
-    x, covariance = engine.propagate(tracks.bank.x[free], tracks.bank.covariance[free], dt)
-    mean, spread = fuse(x, covariance, tracks.bank.probabilities[free])
-    p_enu, spread = mean[:, :3], spread[:, :3, :3]
-    if own is not None:
-        free = np.append(free, OURSELVES)
-        p_enu = np.vstack((p_enu, own.p_enu))
-        spread = np.concatenate((spread, own.variance_m2 * np.eye(3)[None]))
-    measurements = sightings.measurements
-    z, noise = measurements.z[anonymous, :3], measurements.noise[anonymous, :3, :3]
-    column = associate(z, noise, p_enu, spread, config.gate_sigma)
-    rows = sightings.rows.copy()
-    rows[anonymous] = np.append(free, NEW)[column]  # column -1 is none
+    rows, measurements = sightings.rows.copy(), sightings.measurements
+    for confirmed in (True, False):
+        chosen = free[tracks.confirmed[free] == confirmed]
+        left = anonymous[rows[anonymous] == NEW]
+        candidates = _predicted(tracks, chosen, stamp_ns, engine)
+        if own is not None and confirmed:
+            chosen, candidates = np.append(chosen, OURSELVES), _with_ourselves(candidates, own)
+        z, noise = measurements.z[left, :3], measurements.noise[left, :3, :3]
+        column = associate(z, noise, candidates, config.gate_sigma)
+        rows[left] = np.append(chosen, NEW)[column]  # column -1 is none
     return replace(sightings, rows=rows)
+
+
+def _predicted(tracks: Tracks, rows: Rows, stamp_ns: int, engine: Engine) -> Candidates:
+    bank = tracks.bank.take(rows)
+    dt = (stamp_ns - tracks.stamp_ns[rows]) / NS_PER_S
+    x, covariance = engine.propagate(bank.x, bank.covariance, dt)
+    return Candidates(x[..., :3], covariance[..., :3, :3], bank.probabilities)
+
+
+def _with_ourselves(candidates: Candidates, own: Fix) -> Candidates:
+    """The vehicle behind ``candidates``, a mixture of one."""
+    models = candidates.probabilities.shape[1]
+    p_enu = np.broadcast_to(own.p_enu, (1, models, 3))
+    covariance = np.broadcast_to(own.variance_m2 * np.eye(3), (1, models, 3, 3))
+    return Candidates(
+        np.concatenate((candidates.p_enu, p_enu)),
+        np.concatenate((candidates.covariance, covariance)),
+        np.concatenate((candidates.probabilities, np.full((1, models), 1.0 / models))),
+    )
 
 
 def with_anonymous_keys(tracks: Tracks, sightings: Sightings, source: int, stamp_ns: int) -> tuple[Tracks, Rows]:

@@ -15,22 +15,22 @@ from companion.tracking.tracks import BoolArray, Rows, Sightings, Tracks
 from companion.types import Vec3
 
 
-def expire(tracks: Tracks, oldest_ns: int, counts: Counter[str], *, spare_trusted: bool = False) -> Tracks:
-    """Without the tracks whose last measurement, and the keys whose last detection, is before ``oldest_ns``.
+def expire(tracks: Tracks, now_ns: int, coast_ns: int, counts: Counter[str], *, spare_trusted: bool = False) -> Tracks:
+    """Without the tracks that have coasted too long at ``now_ns``, and the keys without detection for ``coast_ns``.
 
     A key ends alone while others keep its track: an id seen again much later may be another obstacle.
 
     Args:
         spare_trusted: the frame that brings the time is of an untrusted source; it ends no trusted track.
     """
-    if len(tracks) and tracks.stamp_ns.min() < oldest_ns:
-        gone = tracks.stamp_ns < oldest_ns
+    gone = tracks.stamp_ns + tracks.coast_ns(coast_ns) < now_ns
+    if gone.any():
         if spare_trusted:
             gone &= ~tracks.trusted
         tracks = _without(tracks, gone, counts, lost="lost")
     keys = tracks.keys
-    if len(keys.names) > len(tracks) and keys.seen_ns.min() < oldest_ns:
-        fresh = keys.seen_ns >= oldest_ns
+    if len(keys.names) > len(tracks) and keys.seen_ns.min() < now_ns - coast_ns:
+        fresh = keys.seen_ns >= now_ns - coast_ns
         if spare_trusted:
             fresh |= tracks.trusted[keys.row]
         tracks = replace(tracks, keys=keys.take(np.flatnonzero(fresh)))

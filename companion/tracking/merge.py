@@ -117,6 +117,8 @@ def union(tracks: Tracks, i: int, j: int, stamp_ns: int, engine: Engine) -> Trac
     stamps, unchecked, apart = tracks.stamp_ns.copy(), tracks.unchecked.copy(), tracks.apart.copy()
     stamps[keep] = tracks.stamp_ns[state_of[0]]
     unchecked[keep] &= unchecked[gone]
+    settled = tracks.settled.copy()
+    settled[keep] |= settled[gone]
     apart[keep] |= apart[gone]
     apart[:, keep] |= apart[:, gone]
     keys = tracks.keys
@@ -125,6 +127,7 @@ def union(tracks: Tracks, i: int, j: int, stamp_ns: int, engine: Engine) -> Trac
         tracks,
         bank=put(tracks.bank, row, tracks.bank.take(state_of)),
         stamp_ns=stamps,
+        settled=settled,
         unchecked=unchecked,
         apart=apart,
         keys=_one_anonymous_each(replace(keys, row=rows), keep),

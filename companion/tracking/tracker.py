@@ -41,7 +41,7 @@ class Tracker:
         self._engine = make_engine(config)
         self._constants = self._engine.constants
         self._rules = Rules(config, self._engine, vehicle_radius_m, round(config.coast_s * NS_PER_S))
-        self._keep_ns = self._rules.coast_ns + round(config.replay_s * NS_PER_S)
+        self._replay_ns = round(config.replay_s * NS_PER_S)
         self._replay = Replay(config.replay_s)
         self._path = OwnPath()
         self._horizons: dict[tuple[float, int, float], Horizon] = {}  # by start after the state, steps and dt_s
@@ -82,7 +82,7 @@ class Tracker:
         picture = self._replay.run(
             frames, self._picture, lambda before, frame: consume(before, frame, self._rules, self._path)
         )
-        self._picture = self._forget(picture, now_ns - self._keep_ns)
+        self._picture = self._forget(picture)
 
     def table(self) -> TrackTable:
         """The tracks at the instant of the last `update`, fused over the models, tentative ones included."""
@@ -155,8 +155,9 @@ class Tracker:
         return self._horizons[key]
 
     def _visible(self) -> BoolArray:
-        """Tracks seen within ``coast_s``."""
-        return np.asarray(self._picture.tracks.stamp_ns >= self._now_ns - self._rules.coast_ns)
+        """Tracks that have not coasted too long."""
+        tracks = self._picture.tracks
+        return np.asarray(tracks.stamp_ns + tracks.coast_ns(self._rules.coast_ns) >= self._now_ns)
 
     def _confirmed(self) -> tuple[Tracks, Bank, Rows]:
         """All tracks, the bank of those that are confirmed and shown, and their rows."""
@@ -164,13 +165,11 @@ class Tracker:
         rows = np.flatnonzero(self._visible() & tracks.confirmed)
         return tracks, tracks.bank if len(rows) == len(tracks) else tracks.bank.take(rows), rows
 
-    def _forget(self, picture: Picture, oldest_ns: int) -> Picture:
+    def _forget(self, picture: Picture) -> Picture:
         """Without the tracks that no frame still admissible could revive."""
-        tracks = picture.tracks
-        if not len(tracks) or tracks.stamp_ns.min() >= oldest_ns:
-            return picture
         counts = picture.counts.copy()
-        return replace(picture, tracks=expire(tracks, oldest_ns, counts), counts=counts)
+        tracks = expire(picture.tracks, self._now_ns - self._replay_ns, self._rules.coast_ns, counts)
+        return picture if tracks is picture.tracks else replace(picture, tracks=tracks, counts=counts)
 
 
 def _read_only(array: FloatArray) -> FloatArray:

@@ -66,6 +66,7 @@ class Tracks:
     chances: IntArray  # (M,) frames of the home source in which a tentative track may still be confirmed
     trusted: BoolArray  # (M,)
     confirmed: BoolArray  # (M,)
+    settled: BoolArray  # (M,) known by a name, or believed at birth: coasts for the whole time
     unchecked: BoolArray  # (M,) born while the vehicle's own path was unknown: may be the vehicle itself
     apart: BoolArray  # (M, M) some source has seen both at one stamp
     keys: Keys
@@ -89,11 +90,20 @@ class Tracks:
 
     def columns(self) -> Columns:
         who = self.stamp_ns, self.born_ns, self.home
-        return *who, self.hits, self.chances, self.trusted, self.confirmed, self.unchecked
+        return *who, self.hits, self.chances, self.trusted, self.confirmed, self.settled, self.unchecked
 
     def advanced(self, bank: Bank, stamp_ns: IntArray, keys: Keys) -> Tracks:
         """The same tracks after a frame; many times faster than `dataclasses.replace`."""
         return _tracks(self.ids, bank, (stamp_ns, *self.columns()[1:]), self.apart, keys)
+
+    def coast_ns(self, most_ns: int) -> IntArray:
+        """(M,) how long after its last measurement each track is still one.
+
+        One that is not settled coasts no longer than twice the time over which it was seen: clutter that looked like an
+        obstacle for two frames is soon gone.
+        """
+        seen_ns = 2 * (self.stamp_ns - self.born_ns)
+        return np.where(self.settled | ~self.confirmed, most_ns, np.minimum(seen_ns, most_ns))
 
     def radius_m(self) -> FloatArray:
         """(M,) the largest of the newest radii that each track's keys state."""
@@ -137,7 +147,8 @@ def no_tracks(constants: Constants) -> Tracks:
     rows = np.zeros(0, dtype=np.intp)
     keys = Keys((), {}, rows, rows, ints, np.zeros(0), flags, ints)
     bank = birth(np.zeros((0, 3)), np.zeros((0, 3, 3)), constants)
-    return Tracks((), bank, ints, ints, rows, ints, ints, flags, flags, flags, np.zeros((0, 0), dtype=np.bool_), keys)
+    columns = ints, ints, rows, ints, ints, flags, flags, flags, flags
+    return _tracks((), bank, columns, np.zeros((0, 0), dtype=np.bool_), keys)
 
 
 def newborn(
@@ -149,7 +160,7 @@ def newborn(
     """
     count = len(found)
     full = bool(found.measurements.full[0])
-    named = np.array([name[1] is not None for name in found.names])
+    believed = np.array([name[1] is not None for name in found.names]) | (found.hits >= config.confirm_hits)
     stamp_ns = np.full(count, origin.stamp_ns, dtype=np.int64)
     home = np.full(count, origin.source, dtype=np.intp)
     return Tracks(
@@ -161,7 +172,8 @@ def newborn(
         hits=found.hits,
         chances=np.full(count, config.confirm_frames, dtype=np.int64),
         trusted=np.full(count, origin.trusted),
-        confirmed=named | (found.hits >= config.confirm_hits),
+        confirmed=believed,
+        settled=believed,
         unchecked=np.full(count, origin.unchecked),
         apart=np.zeros((count, count), dtype=np.bool_),
         keys=first_keys(found, np.arange(count), origin.source, origin.stamp_ns),
