@@ -6,7 +6,8 @@ Two tracks may be the same obstacle while no source has seen both at one stamp. 
     dx^T (P_1 + P_2)^-1 dx <= 16.81                  position and velocity, 99 % of chi-squared with 6 degrees,
 
 and are merged when they have agreed at every check for `merge_s`. Tracks of one obstacle share its process noise, so
-their difference is smaller than P_1 + P_2 says: the test errs on the side of two tracks, which is the safe one.
+their difference is smaller than P_1 + P_2 says: such a pair passes more often than in 99 %; what keeps two obstacles
+two is that they do not touch, for long. Where one track agrees with two that are told apart, the nearer gets it.
 Everything here goes by the stamps of frames, so a replay decides the same.
 """
 
@@ -63,16 +64,18 @@ def merge_agreeing(tracks: Tracks, watch: Watch, stamp_ns: int, merge_s: float, 
     recent = tracks.confirmed & (tracks.stamp_ns >= stamp_ns - RECENT_NS)
     row_of = {name: row for row, name in enumerate(tracks.ids)}
     streaks = {pair: streak for pair, streak in watch.streaks.items() if _waits(tracks, recent, row_of, pair)}
-    merging: list[tuple[str, str]] = []
-    for i, j in zip(*agreeing(tracks, recent, stamp_ns, engine), strict=True):
+    merging: list[tuple[float, tuple[str, str]]] = []
+    for i, j, distance in agreeing(tracks, recent, stamp_ns, engine):
         pair = (tracks.ids[i], tracks.ids[j])
         before = watch.streaks.get(pair)
         streaks[pair] = Streak(stamp_ns) if before is None else replace(before, checks=before.checks + 1)
         if streaks[pair].checks >= CHECKS_MIN and stamp_ns - streaks[pair].since_ns >= merge_s * NS_PER_S:
-            merging.append(pair)
-    for one, other in merging:
-        if one in tracks.ids and other in tracks.ids:  # not yet merged with a third
-            tracks = union(tracks, tracks.ids.index(one), tracks.ids.index(other), stamp_ns, engine)
+            merging.append((distance, pair))
+    for _, pair in sorted(merging):
+        if set(pair).issubset(tracks.ids):  # not yet merged with a third
+            i, j = (tracks.ids.index(name) for name in pair)
+            if not tracks.apart[i, j]:  # nor with one that is told apart from the other
+                tracks = union(tracks, i, j, stamp_ns, engine)
     alive = set(tracks.ids)
     return tracks, Watch(stamp_ns, {pair: streak for pair, streak in streaks.items() if alive.issuperset(pair)})
 
@@ -83,8 +86,8 @@ def _waits(tracks: Tracks, recent: BoolArray, row_of: dict[str, int], pair: tupl
     return min(i, j) >= 0 and not (recent[i] and recent[j]) and not tracks.apart[i, j]
 
 
-def agreeing(tracks: Tracks, recent: BoolArray, stamp_ns: int, engine: Engine) -> tuple[list[int], list[int]]:
-    """Rows i < j of the pairs among the ``recent`` tracks that may be one obstacle at ``stamp_ns``."""
+def agreeing(tracks: Tracks, recent: BoolArray, stamp_ns: int, engine: Engine) -> list[tuple[int, int, float]]:
+    """Pairs of the ``recent`` tracks that may be one obstacle at ``stamp_ns``: rows i < j and their distance."""
     chosen = np.flatnonzero(recent)
     trusted, radius_m = tracks.trusted[chosen], tracks.radius_m()[chosen]
     bank = tracks.bank
@@ -96,7 +99,7 @@ def agreeing(tracks: Tracks, recent: BoolArray, stamp_ns: int, engine: Engine) -
     near &= (trusted[:, None] == trusted) & ~tracks.apart[np.ix_(chosen, chosen)]
     first, second = np.nonzero(np.triu(near, 1))
     if not first.size:
-        return [], []
+        return []
     involved, place = np.unique(np.concatenate((first, second)), return_inverse=True)
     mean, spread = _carried(tracks, chosen[involved], stamp_ns, engine)
     i, j = place[: first.size], place[first.size :]
@@ -104,7 +107,8 @@ def agreeing(tracks: Tracks, recent: BoolArray, stamp_ns: int, engine: Engine) -
     distance = (dx * np.linalg.solve((spread[i] + spread[j])[:, :6, :6], dx[..., None])[..., 0]).sum(axis=1)
     touching = np.linalg.norm(dx[:, :3], axis=1) <= radius_m[first] + radius_m[second]
     agree = np.flatnonzero(touching & (distance <= DISTANCE_MAX))
-    return chosen[first[agree]].tolist(), chosen[second[agree]].tolist()
+    rows = chosen[first[agree]].tolist(), chosen[second[agree]].tolist()
+    return list(zip(*rows, distance[agree].tolist(), strict=True))
 
 
 def union(tracks: Tracks, i: int, j: int, stamp_ns: int, engine: Engine) -> Tracks:

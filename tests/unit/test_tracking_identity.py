@@ -199,6 +199,21 @@ def test_anonymous_keys_of_one_source_are_one_after_a_merge():
     assert keys[-1] == [("cam", "a"), ("lidar", None), ("radar", "x")]
 
 
+@pytest.mark.parametrize("nearer", ["x", "y"])
+def test_of_two_that_are_told_apart_only_the_nearer_is_the_third(nearer):
+    """The radar sees two obstacles that touch, the camera one of them: never three in one."""
+    tracker = Tracker(TrackingConfig(merge_s=0.4))
+    gap = 0.13 if nearer == "x" else 0.17
+    for k in range(40):
+        both = seen("x", at(k), std=0.1), seen("y", beside(at(k), 0.3), std=0.1)
+        give(tracker, frame(STEP_S * k, *both, source="radar", sequence=k))
+        give(tracker, frame(STEP_S * k + 0.01, seen("a", beside(at(k + 0.2), gap), std=0.1), sequence=k))
+    table = tracker.table()
+    assert dict(zip(table.ids, table.sources, strict=True)) == {
+        f"radar/{name}": ("cam", "radar") if name == nearer else ("radar",) for name in ("x", "y")
+    }
+
+
 def test_three_sources_that_agree_at_one_check_are_one():
     tracker, counts = Tracker(TrackingConfig(merge_s=0.3)), set()
     give(tracker, *(frame(0.0, source=name) for name in ("a", "b", "c")))  # the first check finds nothing
