@@ -14,7 +14,7 @@ import numpy as np
 from companion.config import TrackingConfig
 from companion.tracking.associate import Candidates, associate
 from companion.tracking.engine import Engine
-from companion.tracking.measurement import is_finite, measure
+from companion.tracking.measurement import finite, measure
 from companion.tracking.ownship import Fix, Suspects
 from companion.tracking.tracks import NEW, OURSELVES, Key, Rows, Sightings, Tracks, first_keys, join_keys
 from companion.types import NS_PER_S, Detection, DetectionFrame
@@ -33,8 +33,8 @@ def usable(frame: DetectionFrame, last_anonymous_ns: int | None, counts: Counter
     """Finite detections; of each id the first; the anonymous ones by position, none where their stamp is not new."""
     named: dict[str, Detection] = {}
     anonymous: list[Detection] = []
-    for detection in frame.detections:
-        if not is_finite(detection):
+    for detection, is_finite in zip(frame.detections, finite(frame.detections), strict=True):
+        if not is_finite:
             counts["not_finite"] += 1
         elif detection.id is None:
             anonymous.append(detection)

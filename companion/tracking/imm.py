@@ -341,8 +341,10 @@ def widened(spread: FloatArray, bank: Bank, constants: Constants) -> FloatArray:
     agile = np.flatnonzero(factor > 1.0)
     if not agile.size:
         return spread
-    _, covariance = fuse(bank.x[agile], bank.covariance[agile], bank.probabilities[agile])
-    base = covariance[:, :3, :3].reshape(-1, 9)[:, _ENTRIES, None]
+    p, weights = bank.x[agile, :, P], bank.probabilities[agile, None]
+    offset = p - weights @ p
+    second = bank.covariance[agile, :, P, P] + offset[..., :, None] * offset[..., None, :]
+    base = (weights @ second.reshape(-1, MODELS, 9))[:, 0, _ENTRIES, None]
     spread = spread.copy()
     spread[agile] = base + factor[agile, None, None] * (spread[agile] - base)
     return spread

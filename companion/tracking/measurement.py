@@ -14,7 +14,6 @@ from companion.types import Detection, FloatArray
 # A sensor that claims a perfect fix would take the last digit out of the filter; one that claims 100 m says nothing.
 VARIANCE_MIN = 1e-6  # [m^2], [m^2/s^2]
 VARIANCE_MAX = 1e4
-_NO_VELOCITY = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,15 +33,22 @@ class Measurements:
         return (self.z, self.noise) if full else (self.z[:, :3], self.noise[:, :3, :3])
 
 
-def is_finite(detection: Detection) -> bool:
-    """Whether every number of ``detection`` is finite; the wire checks this too, a library user may not."""
+def finite(detections: Sequence[Detection]) -> list[bool]:
+    """Of each detection whether all its numbers are finite; the wire checks this too, a library user may not."""
+    if math.isfinite(sum([_total(detection) for detection in detections])):
+        return [True] * len(detections)  # one that is not makes the sum so, the common case
+    return [math.isfinite(_total(detection)) for detection in detections]
+
+
+def _total(detection: Detection) -> float:
+    """The sum of all numbers, finite if they are: finite ones large enough to overflow do not fly."""
     x, y, z = detection.p_enu.tolist()
-    total = x + y + z + detection.radius_m + (detection.p_std_m or 0.0) + (detection.v_std_m_s or 0.0)
+    total: float = x + y + z + detection.radius_m + (detection.p_std_m or 0.0) + (detection.v_std_m_s or 0.0)
     if detection.v_enu is not None:
         total += sum(detection.v_enu.tolist())
     if detection.covariance is not None:
         total += sum(detection.covariance.ravel().tolist())
-    return math.isfinite(total)  # one that is not makes the sum so, and finite ones as large do not fly
+    return total
 
 
 def measure(detections: Sequence[Detection], config: TrackingConfig) -> Measurements:
@@ -51,27 +57,28 @@ def measure(detections: Sequence[Detection], config: TrackingConfig) -> Measurem
     Variances (eigenvalues, for a covariance) are held within 1e-6 and 1e4, so R is always positive definite. With
     ``force_measurement_variance`` only the position counts, at the configured variance (Remark 1).
     """
-    stated = not config.force_measurement_variance
-    default_m2, default_m2_s2 = config.measurement_variance_m2, config.velocity_std_m_s**2
-    z, diagonal = [], []
-    for detection in detections:
-        v = detection.v_enu if stated else None
-        z.append([*detection.p_enu.tolist(), *(_NO_VELOCITY if v is None else v.tolist())])
-        p_m2 = _held(detection.p_std_m**2 if stated and detection.p_std_m is not None else default_m2)
-        v_m2_s2 = _held(detection.v_std_m_s**2 if detection.v_std_m_s is not None else default_m2_s2)
-        diagonal.append([p_m2, p_m2, p_m2, v_m2_s2, v_m2_s2, v_m2_s2])
-    count = len(detections)
-    noise = np.zeros((count, 6, 6))
-    noise.reshape(count, 36)[:, ::7] = np.array(diagonal).reshape(count, 6)
-    for row, detection in enumerate(detections):
-        if detection.covariance is not None and stated:
-            noise[row] = _bounded(detection.covariance)
-    full = np.array([stated and d.v_enu is not None for d in detections], dtype=np.bool_)
-    return Measurements(np.array(z).reshape(count, 6), noise, full, np.array([d.radius_m for d in detections]))
+    count, stated = len(detections), not config.force_measurement_variance
+    default_m, default_m_s = math.sqrt(config.measurement_variance_m2), config.velocity_std_m_s
+    z, noise = np.zeros((count, 6)), np.zeros((count, 6, 6))
+    z[:, :3] = [detection.p_enu.tolist() for detection in detections] or z[:, :3]
+    full = np.array([stated and detection.v_enu is not None for detection in detections], dtype=np.bool_)
+    p_std = [d.p_std_m if stated and d.p_std_m is not None else default_m for d in detections]
+    diagonal = noise.reshape(count, 36)[:, ::7]
+    diagonal[:, :3] = _held(p_std)
+    diagonal[:, 3:] = _held([default_m_s if d.v_std_m_s is None else d.v_std_m_s for d in detections])
+    if stated:
+        for row, detection in enumerate(detections):
+            if detection.v_enu is not None:
+                z[row, 3:] = detection.v_enu
+            if detection.covariance is not None:
+                noise[row] = _bounded(detection.covariance)
+    return Measurements(z, noise, full, np.array([detection.radius_m for detection in detections]))
 
 
-def _held(variance: float) -> float:
-    return min(max(variance, VARIANCE_MIN), VARIANCE_MAX)
+def _held(std: list[float]) -> FloatArray:
+    """(D, 1) variances within their bounds."""
+    squared = np.array(std, dtype=np.float64) ** 2
+    return np.asarray(np.minimum(np.maximum(squared, VARIANCE_MIN), VARIANCE_MAX)[:, None])
 
 
 def _bounded(covariance: FloatArray) -> FloatArray:

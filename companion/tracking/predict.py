@@ -55,10 +55,12 @@ def _ct_parts() -> FloatArray:
 
 _PARTS = _ct_parts()
 _PARTS_T = np.ascontiguousarray(_PARTS[:_MEANS].T)
-# (6, 49): where entry (r, c) of S_kl stands in the flattened (21, 21)
-_ENTRY_OF = np.array(
-    [[(3 * k + r) * _ALL + 3 * m + c for k in range(_BASIS) for m in range(_BASIS)] for r, c in _ENTRIES]
-)
+# b_k b_l = b_l b_k: the sum over all pairs is one over k <= l with S_kl + S_lk, the squares last.
+_K, _L = (np.concatenate((off, np.arange(_BASIS))) for off in np.triu_indices(_BASIS, 1))
+_OFF = len(_K) - _BASIS
+# (6, 28): where entry (r, c) of S_kl stands in the flattened (21, 21), and (6, 21) where that of S_lk does
+_ENTRY_OF = np.array([(3 * _K + r) * _ALL + 3 * _L + c for r, c in _ENTRIES])
+_MIRRORED = np.array([(3 * _L + r) * _ALL + 3 * _K + c for r, c in _ENTRIES])[:, :_OFF]
 # Every e_k of CT is one component of its state or none, with a sign: its second moments are picked, not multiplied.
 _CT_SIGN = _PARTS.sum(axis=1)
 _CT_FROM = np.abs(_PARTS).argmax(axis=1)
@@ -115,12 +117,14 @@ def predict_positions(
         p_enu (M, K, 3) [m] and the entries xx, yy, zz, yz, xz, xy of its covariance (M, 6, K) [m^2], spread of means
         included.
     """
-    tracks, steps = x.shape[0], at.tau_s.shape[1]
+    tracks = x.shape[0]
     basis = _basis(x, at)
     mean, second = _moments(x, covariance, probabilities)
     p_enu = basis[:, :5].swapaxes(1, 2) @ mean.reshape(tracks, 5, 3)
-    products = (basis[:, :, None] * basis[:, None]).reshape(tracks, _BASIS**2, steps)
-    spread = second.reshape(tracks, _ALL**2).take(_ENTRY_OF, axis=1) @ products
+    flat = second.reshape(tracks, _ALL**2)
+    weights = flat.take(_ENTRY_OF, axis=1)
+    weights[..., :_OFF] += flat.take(_MIRRORED, axis=1)
+    spread = weights @ (basis.take(_K, axis=1) * basis.take(_L, axis=1))
     spread[:, :3] += probabilities[:, None] @ at.noise
     wandering = (probabilities[:, CT, None] * at.turn_noise)[:, None] * basis[:, 5:]
     spread[:, :2] += wandering * basis[:, 5:]
