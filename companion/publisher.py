@@ -15,6 +15,7 @@ from companion.record import Recorder
 from companion.report import FlightHash, tracks_out, vehicle_out
 from companion.session import VehicleSession
 from companion.state import State
+from companion.tracking.agility import AGILE
 from companion.types import NS_PER_S, DetectionFrame, TrackTable, Vec3, VehicleState
 
 log = logging.getLogger("companion")
@@ -32,6 +33,7 @@ class Publisher:
         self._hash = FlightHash()
         self._verdict = "silent"
         self._tracks = 0
+        self._agile: list[str] = []
         self._flushed_ns = 0
         self._last: tuple[int, object] | None = None
 
@@ -54,6 +56,7 @@ class Publisher:
         self._zenoh.put_encoded("companion/setpoint", payload)
         table = tracks()
         self._tracks = len(table)
+        self._agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
         if self._recorder is not None:
             self._recorder.frames(frames, vehicle.stamp_ns)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
@@ -111,6 +114,7 @@ class Publisher:
             airborne=situation.airborne,
             target=target,
             tracks=self._tracks,
+            agile=self._agile,
             verdict=self._verdict,
             counts=dict(counts()),
             tick_ms=meter.quantiles_ms(last=1000),

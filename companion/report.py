@@ -68,6 +68,8 @@ def tracks_out(output: PilotOutput, table: TrackTable) -> TracksOut:
         table.mode_probabilities.tolist(),
         table.status,
         table.sources,
+        table.surprise.tolist(),
+        table.growth.tolist(),
         strict=True,
     )
     return TracksOut(
@@ -84,8 +86,10 @@ def tracks_out(output: PilotOutput, table: TrackTable) -> TracksOut:
                 predicted=[tuple(q) for q in predicted.get(name, [])],
                 status=status,
                 sources=list(sources),
+                surprise=surprise,
+                growth=growth,
             )
-            for name, p, v, a, radius, covariance, mu, status, sources in rows
+            for name, p, v, a, radius, covariance, mu, status, sources, surprise, growth in rows
         ],
     )
 

@@ -95,6 +95,8 @@ class TrackTable:
     mode_probabilities: FloatArray  # (M, 3)
     radius_m: FloatArray  # (M,)
     age_s: FloatArray  # (M,) time since the last update of each
+    surprise: FloatArray  # (M,) root mean square of the innovations of its own predictions, 1 where its models are true
+    growth: FloatArray  # (M,) how much faster than its models say its predicted covariance grows, 1 where they are true
     status: tuple[str, ...]  # "tentative", "confirmed", "coasting": the newest frame of none of its sources showed it
     sources: tuple[tuple[str, ...], ...]  # names of the sources that see each, sorted
 

@@ -139,6 +139,8 @@ class TrackOut(Struct, frozen=True, kw_only=True):
     predicted: list[Vec]  # on the barrier grid, from the instant at which the setpoint acts; empty for a tentative one
     status: str  # "tentative", "confirmed", "coasting"
     sources: list[str]  # that see it
+    surprise: float  # root mean square of its predictions' innovations, 1 where its models are true
+    growth: float  # how much faster than its models say its predicted covariance grows
 
 
 class TracksOut(Struct, frozen=True, kw_only=True):
@@ -159,6 +161,7 @@ class Status(Struct, frozen=True, kw_only=True):
     airborne: bool
     target: Vec | None
     tracks: int
+    agile: list[str]  # tracks that break their assumed agility: their predictions are widened at least twofold
     verdict: str
     counts: dict[str, int]  # ticks by verdict, frames by reason of rejection
     tick_ms: dict[str, float]  # p50, p99, max of the last 1000 ticks

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.config import TrackingConfig
+from companion.tracking.bank import birth, put
 from companion.tracking.engine import Engine
 from companion.tracking.identity import unbound, with_anonymous_keys
-from companion.tracking.imm import birth, put
 from companion.tracking.tracks import BoolArray, IntArray, Rows, Sightings, Tracks
 from companion.types import NS_PER_S, FloatArray
 

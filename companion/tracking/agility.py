@@ -32,6 +32,7 @@ from companion.types import FloatArray
 BoolArray = npt.NDArray[np.bool_]
 
 LOOK_S = 0.25
+AGILE = 2.0  # a track whose predictions are widened so much breaks its assumed agility, and the status says so
 NIS_CAP = 20.0  # of one note: a jump of the measurement itself says little about agility
 NIS_SQUARE = 5.0 / 3.0  # expected square of a chi-squared of three degrees of freedom over three
 RISE = 3.0  # what a track has shown is believed this much faster than forgotten
@@ -111,7 +112,12 @@ def take_notes(
     return notes
 
 
+def surprise(means: FloatArray) -> FloatArray:
+    """Root mean square of the innovations looked back on, (M,), 1 for a filter whose models are true."""
+    return np.asarray(np.sqrt(means[:, SQUARE]))
+
+
 def growth_factor(means: FloatArray, watch: Watch) -> FloatArray:
     """How much faster than its models say the predicted covariance of each track grows, (M,), 1 where they hold."""
-    excess = (np.sqrt(means[:, SQUARE]) - watch.bound) / np.maximum(means[:, SHARE], _SHARE_MIN)
+    excess = (surprise(means) - watch.bound) / np.maximum(means[:, SHARE], _SHARE_MIN)
     return np.asarray(1.0 + np.minimum(np.maximum(excess, 0.0), watch.factor_max - 1.0))

@@ -11,6 +11,7 @@ import numpy as np
 
 from companion.config import TrackingConfig
 from companion.tracking import imm, predict
+from companion.tracking.bank import Bank, Constants, build_constants
 from companion.tracking.models import MODELS, propagate
 from companion.types import FloatArray
 
@@ -20,11 +21,11 @@ BLOCK = 128  # tracks; their covariances are 0.3 MB
 class Engine(Protocol):
     """An IMM filter over a `Bank` of tracks; pure functions of their arguments."""
 
-    constants: imm.Constants
+    constants: Constants
 
     def step(
-        self, bank: imm.Bank, dt: FloatArray, z: FloatArray, noise: FloatArray, *, foreign: bool = False
-    ) -> tuple[imm.Bank, FloatArray]:
+        self, bank: Bank, dt: FloatArray, z: FloatArray, noise: FloatArray, *, foreign: bool = False
+    ) -> tuple[Bank, FloatArray]:
         """`imm.step`."""
 
     def propagate(self, x: FloatArray, covariance: FloatArray, dt: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -40,16 +41,16 @@ class BatchedEngine:
     """All tracks at once in numpy, in blocks of `BLOCK` rows, so that the intermediate arrays stay in the cache."""
 
     def __init__(self, config: TrackingConfig) -> None:
-        self.constants = imm.build_constants(config)
+        self.constants = build_constants(config)
 
     def step(
-        self, bank: imm.Bank, dt: FloatArray, z: FloatArray, noise: FloatArray, *, foreign: bool = False
-    ) -> tuple[imm.Bank, FloatArray]:
+        self, bank: Bank, dt: FloatArray, z: FloatArray, noise: FloatArray, *, foreign: bool = False
+    ) -> tuple[Bank, FloatArray]:
         if len(bank) <= BLOCK:
             return imm.step(bank, dt, z, noise, self.constants, foreign=foreign)
-        after, nis = imm.Bank(*(np.empty_like(part) for part in bank.parts())), np.empty((len(bank), MODELS))
+        after, nis = Bank(*(np.empty_like(part) for part in bank.parts())), np.empty((len(bank), MODELS))
         for rows in _blocks(len(bank)):
-            block = imm.Bank(*(part[rows] for part in bank.parts()))
+            block = Bank(*(part[rows] for part in bank.parts()))
             stepped, nis[rows] = imm.step(block, dt[rows], z[rows], noise[rows], self.constants, foreign=foreign)
             for whole, part in zip(after.parts(), stepped.parts(), strict=True):
                 whole[rows] = part

@@ -17,8 +17,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from companion.tracking.bank import put
 from companion.tracking.engine import Engine
-from companion.tracking.imm import fuse, fuse_mean, put
+from companion.tracking.imm import fuse, fuse_mean
 from companion.tracking.tracks import BoolArray, IntArray, Keys, Rows, Tracks
 from companion.types import NS_PER_S, FloatArray
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from companion.tracking.imm import Constants
+from companion.tracking.bank import Constants
 from companion.tracking.merge import Watch
 from companion.tracking.ownship import Suspects
 from companion.tracking.tracks import BoolArray, Tracks, no_tracks

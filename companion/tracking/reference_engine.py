@@ -13,7 +13,7 @@ import numpy as np
 from companion.config import TrackingConfig
 from companion.errors import ConfigError
 from companion.tracking import agility
-from companion.tracking.imm import Bank, build_constants
+from companion.tracking.bank import Bank, build_constants
 from companion.tracking.predict import Horizon
 from companion.tracking.reference import SLOTS, ReferenceImm
 from companion.types import FloatArray

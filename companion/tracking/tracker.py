@@ -15,9 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from companion.config import TrackingConfig
+from companion.tracking.agility import growth_factor, surprise
+from companion.tracking.bank import Bank
 from companion.tracking.cycle import Rules, consume
 from companion.tracking.engine import make_engine
-from companion.tracking.imm import Bank, fuse, fuse_mean, widened
+from companion.tracking.imm import fuse, fuse_mean, widened
 from companion.tracking.lifecycle import expire
 from companion.tracking.models import propagate_mean, shared
 from companion.tracking.ownship import OwnPath
@@ -103,6 +105,8 @@ class Tracker:
             mode_probabilities=_read_only(bank.probabilities[seen]),
             radius_m=_read_only(tracks.radius_m()[seen]),
             age_s=_read_only((self._now_ns - tracks.stamp_ns[seen]) / NS_PER_S),
+            surprise=_read_only(surprise(bank.means[seen])),
+            growth=_read_only(growth_factor(bank.means[seen], self._constants.watch)),
             status=tuple([status[row] for row in seen]),
             sources=tuple([sources[row] for row in seen]),
         )

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from companion.config import TrackingConfig
-from companion.tracking.imm import Bank, Constants, birth, join
+from companion.tracking.bank import Bank, Constants, birth, join
 from companion.tracking.measurement import Measurements
 from companion.types import FloatArray
 

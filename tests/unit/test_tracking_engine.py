@@ -9,8 +9,8 @@ from companion.config import TrackingConfig, parse_config
 from companion.errors import ConfigError
 from companion.tracking import engine
 from companion.tracking.agility import growth_factor
+from companion.tracking.bank import birth
 from companion.tracking.engine import BatchedEngine, make_engine
-from companion.tracking.imm import birth
 from companion.tracking.predict import horizon
 from companion.tracking.reference_engine import ReferenceEngine
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from companion.config import TrackingConfig, parse_config
-from companion.tracking.imm import birth, build_constants, correct, fuse, join, markov, mix, put, step
+from companion.tracking.bank import birth, build_constants, join, put
+from companion.tracking.imm import correct, fuse, markov, mix, step
 from companion.tracking.models import CA, CT, CV, HAS_BLOCK, SIZE, TURN
 from companion.tracking.reference import ReferenceImm
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from companion.config import TrackingConfig, parse_config
-from companion.tracking.imm import birth, build_constants, fuse, step
+from companion.tracking.bank import birth, build_constants
+from companion.tracking.imm import fuse, step
 from companion.tracking.models import CA, CT, HAS, SIZE, propagate
 from companion.tracking.predict import horizon, largest_sigma, predict_positions
 

@@ -8,7 +8,7 @@ from tracking_scenes import S, assert_same_bits, frame, give, seen
 
 from companion.config import TrackingConfig
 from companion.tracking import replay
-from companion.tracking.imm import build_constants
+from companion.tracking.bank import build_constants
 from companion.tracking.picture import empty_picture
 from companion.tracking.replay import REPLAY_FRAMES, Replay
 from companion.tracking.tracker import Tracker
