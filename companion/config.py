@@ -93,7 +93,7 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     jump_sigma: Positive = 10.0  # a named detection farther off is skipped once, then the track restarts there
     likelihood_window: Annotated[int, Meta(ge=1, le=20)] = 1  # updates
     velocity_std_m_s: Positive = 0.5  # used where a detection states a velocity without its deviation
-    nis_memory_s: Positive = 4.0  # over which the innovations of a track's predictions are averaged
+    nis_memory_s: Positive = 2.5  # over which the innovations of a track's predictions are averaged
     nis_bound: Positive = 0.97  # their root mean square, 1 for true models, above which a track breaks its own
     inflation_max: Annotated[float, Meta(ge=1.0, le=100.0)] = 10.0  # most that this widens its predictions; 1: never
     gate_sigma: Positive = 4.0
