@@ -44,7 +44,7 @@ _EXPONENTS = np.arange(_ORDER + 1.0)
 # (re, im) of two complex factors -> their 2x2 matrices [[re, -im], [im, re]], row-major
 _AS_MATRIX = np.kron(np.eye(2), np.array([[1.0, 0.0, 0.0, 1.0], [0.0, -1.0, 1.0, 0.0]]))
 _FLAT = MODELS * SIZE * SIZE
-_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(8)
+_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(12)
 # A Wiener turn rate is one integration away from the heading, two from the position; see `turn_noise`.
 _RANK = np.array([0, 0, 0, 1, 1, 1, 3, 3, 3, 2])
 _WEIGHT = np.array([[1 / 5, 1 / 4, 1 / 3, 0.0], [1 / 4, 1 / 3, 1 / 2, 0.0], [1 / 3, 1 / 2, 1.0, 0.0], [0.0] * 4])
@@ -216,11 +216,11 @@ def _steps(models: MotionModels, dt: FloatArray) -> Step:
 def _let_accelerations_die(transition: FloatArray, noise: FloatArray, dt: FloatArray, models: MotionModels) -> None:
     """Singer's CA in place of the plain one: a' = -alpha a + white jerk; writes F (L, 10, 10) and Q (L, 10, 10).
 
-    Q = q integral_0^dt c c^T ds, c(s) = (phi, phi', phi'')(s) `acceleration_response`; eight Gauss-Legendre nodes
+    Q = q integral_0^dt c c^T ds, c(s) = (phi, phi', phi'')(s) `acceleration_response`; twelve Gauss-Legendre nodes
     leave an error below 1e-12 of it up to alpha dt = 5. Source: Singer, IEEE TAES 1970.
     """
     at_end = acceleration_response(dt, models.accel_decay_hz)  # (3, L)
-    inside = acceleration_response(0.5 * dt[:, None] * (_NODES + 1.0), models.accel_decay_hz)  # (3, L, 8)
+    inside = acceleration_response(0.5 * dt[:, None] * (_NODES + 1.0), models.accel_decay_hz)  # (3, L, 12)
     density = (0.5 * models.jerk_psd * dt)[:, None] * _NODE_WEIGHTS
     integral = np.einsum("iln,jln,ln->lij", inside, inside, density)
     for axis in range(3):

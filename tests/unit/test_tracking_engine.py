@@ -13,6 +13,8 @@ from companion.tracking.bank import birth
 from companion.tracking.engine import BatchedEngine, make_engine
 from companion.tracking.predict import horizon
 from companion.tracking.reference_engine import ReferenceEngine
+from companion.tracking.tracker import Tracker
+from companion.types import Detection, DetectionFrame, DetectionKind, frozen
 
 PAPER = parse_config({"tracking": {"preset": "paper"}}).tracking
 CONFIGS = {
@@ -122,3 +124,39 @@ def test_a_note_that_is_never_looked_at_again_judges_nothing():
     after, _ = batched.step(bank, np.array([0.7]), np.full((1, 3), 5.0), noise)
     assert np.array_equal(after.means, bank.means)
     assert after.notes[0, 0] == 0.0
+
+
+def test_a_tracker_on_the_reference_is_the_same_tracker():
+    """Two sources with their own rates, late frames, losses, velocities, anonymous detections, foreign tracks."""
+    config = TrackingConfig(merge_s=0.5)
+    flying, plain = Tracker(config), Tracker(TrackingConfig(merge_s=0.5, backend="reference"))
+    rng = np.random.default_rng(8)
+    p, v = jinking(rng, 3, 90)
+    p[:, 0], v[:, 0] = 0.05 * np.arange(90.0)[:, None] * (1.0, 0.4, 0.0), (1.0, 0.4, 0.0)
+    for k in range(90):
+        stamp_ns, frames = k * 50_000_000, []
+        seen = [
+            Detection("ab"[m], frozen(p[k, m] + rng.normal(scale=0.05, size=3)), 0.2, 0.05)
+            for m in range(2)
+            if rng.random() < 0.8
+        ]
+        if k % 10 != 4:
+            found = [*seen, Detection(None, frozen(p[k, 2] + 5.0 + rng.normal(scale=0.05, size=3)), 0.2, 0.05)]
+            frames.append(DetectionFrame(stamp_ns, "cam", k, DetectionKind.DETECTION, tuple(found)))
+        if k % 3 == 2:  # the radar's frames are two ticks old
+            old = p[k - 2, 0] + rng.normal(scale=0.1, size=3)
+            one = Detection("r", frozen(old), 0.2, 0.1, frozen(v[k - 2, 0]), 0.3)
+            kind = DetectionKind.TRACK if k % 2 else DetectionKind.DETECTION
+            frames.append(DetectionFrame(stamp_ns - 100_000_000, "radar", k, kind, (one,)))
+        for tracker in (flying, plain):
+            tracker.update(frames, stamp_ns)
+        if k % 6 == 5:
+            one, other = flying.table(), plain.table()
+            assert (one.ids, one.status, one.sources) == (other.ids, other.status, other.sources)
+            for name in ("p_enu", "v_enu", "a_enu", "covariance", "mode_probabilities", "surprise", "growth"):
+                np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9, err_msg=name)
+            ahead, too = flying.predict(stamp_ns + 70_000_000, 12, 0.05), plain.predict(stamp_ns + 70_000_000, 12, 0.05)
+            for name in ("p_enu", "sigma_m", "v_enu", "a_enu"):
+                np.testing.assert_allclose(getattr(ahead, name), getattr(too, name), rtol=1e-9, atol=1e-9, err_msg=name)
+    table = flying.table()
+    assert table.sources[table.ids.index("cam/a")] == ("cam", "radar"), "the tracks of one obstacle became one"

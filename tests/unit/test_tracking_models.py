@@ -105,7 +105,7 @@ def test_dying_accelerations_are_singers_by_the_matrix_exponential(memory_s, dt)
     moved, noise = propagate(one(CA, state), np.zeros((1, 3, SIZE, SIZE)), np.array([dt]), models)
     np.testing.assert_allclose(moved[0, CA, :9], np.kron(f, np.eye(3)) @ state[:9], rtol=1e-12)
     q = np.kron(f @ exponential[:3, 3:], np.eye(3))
-    np.testing.assert_allclose(noise[0, CA, :9, :9], q, rtol=1e-6, atol=1e-6 * q.max())
+    np.testing.assert_allclose(noise[0, CA, :9, :9], q, rtol=1e-11, atol=1e-11 * q.max())
 
 
 def test_a_memory_without_end_is_the_plain_acceleration():

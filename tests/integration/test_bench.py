@@ -1,0 +1,72 @@
+"""`companion bench`: one JSON object or tables, the figures held on seeds that nothing was tuned on."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from companion.bench import accuracy, command, timing, tracking
+from companion.cli import main
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole command on two seconds of one condition, two counts of obstacles and five seconds of crossing."""
+    monkeypatch.setattr(tracking, "HEADLINE", tracking.HEADLINE[1:])
+    monkeypatch.setattr(tracking, "CROSSING_SEEDS", (3,))
+    monkeypatch.setattr(tracking, "COUNTS", (100, 1000))
+    monkeypatch.setattr(accuracy, "DURATION_S", 2.0)
+    monkeypatch.setattr(tracking.crossing, "DURATION_S", 5.0)
+    monkeypatch.setattr(tracking, "measure_timing", lambda count, repeats, **kw: timing.measure_timing(count, 3, **kw))
+
+
+@pytest.mark.usefixtures("small")
+def test_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "tracking", "--quick", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["bench"], told["schema"]) == ("tracking", 1)
+    (cell,) = told["results"]["accuracy"]
+    assert set(cell["filters"]) == {"ours", "paper", "CV only", "CA only", "hindsight", "filterpy IMM"}
+    assert all(len(scores["ahead_0.25_m"]) == 9 for scores in cell["filters"].values())
+    assert set(told["results"]["crossing"]["3"]) == {"ours", "paper", "CV only", "CA only", "filterpy IMM"}
+    assert [timing["obstacles"] for timing in told["results"]["timing_ms"]] == [100, 1000]
+    assert {figure["relation"] for figure in told["figures"]} == {"at most", "at least"}
+    assert told["results"]["seeds"]["report"] != told["results"]["seeds"]["tuning"]
+
+
+@pytest.mark.usefixtures("small")
+def test_tables_for_people_and_no_filterpy(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: None)
+    assert main(["bench", "tracking", "--quick"]) == 0
+    out = capsys.readouterr().out
+    for text in ("hindsight", "eight 3 m/s", "swaps, seed 3", "times faster", "figures"):
+        assert text in out
+    assert "filterpy IMM" not in out
+
+
+def test_tuning_without_filterpy_is_wrong_usage(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: None)
+    assert main(["bench", "tracking", "--tune-rivals"]) == 2
+    assert "filterpy" in capsys.readouterr().err
+
+
+def test_help_shows_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["bench", "tracking", "--help"])
+    assert stopped.value.code == 0
+    assert "companion bench tracking --json > tracking.json" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_figures_of_accuracy_and_identity_are_met() -> None:
+    """Those of time depend on the machine and are not tested."""
+    cells = [
+        tracking.measure_cell(cell, seed=tracking.REPORT_SEED, trials=tracking.TRIALS, filterpy=False)
+        for cell in tracking.HEADLINE
+    ]
+    crossings = {seed: tracking.measure_crossing(seed, filterpy=False) for seed in tracking.CROSSING_SEEDS}
+    missed = [figure for figure in tracking.figures(cells, crossings, []) if not figure.met]
+    assert not missed
