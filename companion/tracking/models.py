@@ -175,24 +175,6 @@ def propagate(
     return moved, spread
 
 
-def propagate_mean(x: FloatArray, dt: FloatArray, models: MotionModels) -> FloatArray:
-    """The x' of `propagate` alone, (M, 3, 10): what a prediction's velocity needs, at a fraction of the cost."""
-    moved = x.copy()
-    reach, speed, left = acceleration_response(dt[:, None], models.accel_decay_hz)
-    moved[:, :CT, P] += dt[:, None, None] * x[:, :CT, V]
-    moved[:, CA, P] += reach * x[:, CA, A]
-    moved[:, CA, V] += speed * x[:, CA, A]
-    moved[:, CA, A] *= left
-    rotation, integral, _ = turn_terms(x[:, CT, TURN], dt)
-    w = horizontal_velocity(x)
-    there, turned = integral * w, rotation * w
-    moved[:, CT, 0] += there.real
-    moved[:, CT, 1] += there.imag
-    moved[:, CT, 2] += dt * x[:, CT, 5]
-    moved[:, CT, 3], moved[:, CT, 4] = turned.real, turned.imag
-    return moved
-
-
 def shared(dt: FloatArray) -> float | None:
     """The one dt of all tracks, as in a frame of one source; None where they differ or there are no tracks."""
     values: list[float] = dt.tolist()

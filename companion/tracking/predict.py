@@ -20,6 +20,7 @@ import numpy as np
 from companion.tracking.models import (
     CA,
     CT,
+    CV,
     MODELS,
     SIZE,
     TURN,
@@ -130,6 +131,24 @@ def predict_positions(
     spread[:, :2] += wandering * basis[:, 5:]
     spread[:, _XY] += wandering[:, 0] * basis[:, 6]
     return p_enu, spread
+
+
+def velocity_ahead(
+    x: FloatArray, probabilities: FloatArray, dt: FloatArray, models: MotionModels
+) -> tuple[FloatArray, FloatArray]:
+    """Fused velocity and acceleration ``dt`` (M,) on, (M, 3) each [m/s], [m/s^2]: every model by its own dynamics."""
+    _, speed, left = acceleration_response(dt, models.accel_decay_hz)
+    cv, ca, ct = probabilities.T
+    turn = x[:, CT, TURN]
+    w = horizontal_velocity(x) * np.exp(1j * turn * dt) * ct
+    a = (ca * left)[:, None] * x[:, CA, A]
+    v = cv[:, None] * x[:, CV, V] + ca[:, None] * x[:, CA, V] + (ca * speed)[:, None] * x[:, CA, A]
+    v[:, 0] += w.real
+    v[:, 1] += w.imag
+    v[:, 2] += ct * x[:, CT, 5]
+    a[:, 0] -= turn * w.imag
+    a[:, 1] += turn * w.real
+    return v, a
 
 
 def _basis(x: FloatArray, at: Horizon) -> FloatArray:

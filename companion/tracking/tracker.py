@@ -19,12 +19,12 @@ from companion.tracking.agility import growth_factor, surprise
 from companion.tracking.bank import Bank
 from companion.tracking.cycle import Rules, consume
 from companion.tracking.engine import make_engine
-from companion.tracking.imm import fuse, fuse_mean, widened
+from companion.tracking.imm import fuse, widened
 from companion.tracking.lifecycle import expire
-from companion.tracking.models import propagate_mean, shared
+from companion.tracking.models import shared
 from companion.tracking.ownship import OwnPath
 from companion.tracking.picture import Picture, empty_picture, source_names, statuses
-from companion.tracking.predict import Horizon, horizon, largest_sigma
+from companion.tracking.predict import Horizon, horizon, largest_sigma, velocity_ahead
 from companion.tracking.replay import Replay
 from companion.tracking.tracks import BoolArray, Rows, Tracks
 from companion.types import NS_PER_S, DetectionFrame, FloatArray, Prediction, TrackTable, VehicleState
@@ -120,15 +120,15 @@ class Tracker:
         tracks, bank, rows = self._confirmed()
         since_s = (start_ns - tracks.stamp_ns[rows]) / NS_PER_S
         p_enu, spread = self._ahead(bank, self._grid(since_s, steps, dt_s))
-        mean = fuse_mean(propagate_mean(bank.x, since_s, self._constants.models), bank.probabilities)
+        v_enu, a_enu = velocity_ahead(bank.x, bank.probabilities, since_s, self._constants.models)
         return Prediction(
             start_ns=start_ns,
             dt_s=dt_s,
             ids=tracks.ids if len(rows) == len(tracks) else tuple([tracks.ids[row] for row in rows]),
             p_enu=_read_only(p_enu),
             sigma_m=_read_only(largest_sigma(spread)),
-            v_enu=_read_only(mean[:, 3:6]),
-            a_enu=_read_only(mean[:, 6:9]),
+            v_enu=_read_only(v_enu),
+            a_enu=_read_only(a_enu),
             radius_m=_read_only(tracks.radius_m()[rows]),
         )
 

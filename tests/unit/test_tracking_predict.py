@@ -7,7 +7,7 @@ from companion.config import TrackingConfig, parse_config
 from companion.tracking.bank import birth, build_constants
 from companion.tracking.imm import fuse, step
 from companion.tracking.models import CA, CT, HAS, SIZE, propagate
-from companion.tracking.predict import horizon, largest_sigma, predict_positions
+from companion.tracking.predict import horizon, largest_sigma, predict_positions, velocity_ahead
 
 LASTING = TrackingConfig(accel_memory_s=0.0)
 PAPER = parse_config({"tracking": {"preset": "paper"}}).tracking
@@ -132,3 +132,14 @@ def test_no_tracks_predict_to_empty_arrays():
     )
     assert p.shape == (0, 5, 3)
     assert largest_sigma(spread).shape == (0, 5)
+
+
+@pytest.mark.parametrize("config", [LASTING, TrackingConfig()], ids=["lasting", "default"])
+def test_velocity_and_acceleration_ahead_are_those_of_the_carried_models(config):
+    bank, constants = flown_bank(config)
+    dt = np.array([0.0, 0.02, 0.3, 0.7, -0.05])
+    x, covariance = propagate(bank.x, bank.covariance, dt, constants.models)
+    mean, _ = fuse(x, covariance, bank.probabilities)
+    v, a = velocity_ahead(bank.x, bank.probabilities, dt, constants.models)
+    np.testing.assert_allclose(v, mean[:, 3:6], atol=1e-12)
+    np.testing.assert_allclose(a, mean[:, 6:9], atol=1e-12)
