@@ -75,7 +75,7 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     backend: Literal["batched", "reference"] = "batched"  # the same filter; reference: plainly on filterpy, and slow
     dt_s: Positive = 0.05  # the grid for which per-step constants are stated
     accel_psd_cv: Positive = 4e-4  # white acceleration PSD of CV [m^2/s^3]
-    jerk_psd_ca: Positive = 30.0  # white jerk PSD of CA [m^2/s^5]
+    jerk_psd_ca: Positive = 32.0  # white jerk PSD of CA [m^2/s^5]
     accel_psd_ct: Positive = 0.006  # white acceleration PSD of CT [m^2/s^3]
     accel_memory_s: Annotated[float, Meta(ge=0.0, le=5.0)] = (
         0.2  # CA's acceleration dies out with it (Singer); 0: it lasts
@@ -93,7 +93,7 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     jump_sigma: Positive = 10.0  # a named detection farther off is skipped once, then the track restarts there
     likelihood_window: Annotated[int, Meta(ge=1, le=20)] = 1  # updates
     velocity_std_m_s: Positive = 0.5  # used where a detection states a velocity without its deviation
-    nis_memory_s: Positive = 2.5  # over which the innovations of a track's predictions are averaged
+    nis_memory_s: Positive = 3.0  # over which the innovations of a track's predictions are averaged
     nis_bound: Positive = 0.97  # their root mean square, 1 for true models, above which a track breaks its own
     inflation_max: Annotated[float, Meta(ge=1.0, le=100.0)] = 10.0  # most that this widens its predictions; 1: never
     gate_sigma: Positive = 4.0
