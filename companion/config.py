@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from companion.config_check import check_arena, check_tick, pointed
+from companion.config_check import check_arena, check_confirmation, check_tick, pointed
 from companion.errors import ConfigError
 from companion.profiles import PROFILES, Profile
 
@@ -248,6 +248,7 @@ def parse_config(raw: Mapping[str, Any], *, source: str = "configuration") -> Co
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {pointed(str(error))}") from None
     check_tick(config.rate_hz, source)
+    check_confirmation(config.tracking.confirm_hits, config.tracking.confirm_frames, source)
     check_arena(config.limits.arena_min, config.limits.arena_max, config.target.position, source)
     if config.sync == "none" and config.lockstep_sources:
         raise ConfigError(f'{source}: lockstep_sources: expected only with sync = "lockstep"')

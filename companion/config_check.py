@@ -35,3 +35,11 @@ def check_tick(rate_hz: int, source: str) -> None:
     """Raise ConfigError unless the control period is whole milliseconds: setpoints carry such stamps."""
     if 1000 % rate_hz:
         raise ConfigError(f"{source}: tick_hz: expected a control period of whole milliseconds, got {rate_hz} Hz")
+
+
+def check_confirmation(hits: int, frames: int, source: str) -> None:
+    """Raise ConfigError where no anonymous obstacle could ever be confirmed."""
+    if hits > frames + 1:
+        raise ConfigError(
+            f"{source}: tracking.confirm_hits: expected at most confirm_frames + 1 = {frames + 1}, got {hits}"
+        )

@@ -60,11 +60,14 @@ def consume(picture: Picture, frame: DetectionFrame, rules: Rules, path: OwnPath
         tracks, fresh = make_room(tracks, fresh, trusted, config.max_tracks, p_own, counts)
         origin = Origin(stamp_ns, source.number, trusted, unchecked=own is None)
         tracks, source = _begin(tracks, fresh, source, origin, rules)
-    sources, watch = {**picture.sources, frame.source: source}, picture.watch
+    sources, watches = {**picture.sources, frame.source: source}, picture.watches
     if len(sources) > 1 and config.merge_s > 0.0:
         tracks = tell_apart(tracks, source.number, stamp_ns)
-        tracks, watch = merge_agreeing(tracks, watch, stamp_ns, config.merge_s, rules.engine)
-    return Picture(tracks, sources, suspects, watch, counts)
+        tracks, watch = merge_agreeing(
+            tracks, watches[trusted], stamp_ns, config.merge_s, rules.engine, trusted=trusted
+        )
+        watches = (watches[0], watch) if trusted else (watch, watches[1])
+    return Picture(tracks, sources, suspects, watches, counts)
 
 
 def _placed(

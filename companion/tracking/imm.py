@@ -224,7 +224,8 @@ def fuse(x: FloatArray, covariance: FloatArray, probabilities: FloatArray) -> tu
 def widened(spread: FloatArray, bank: Bank, constants: Constants) -> FloatArray:
     """Predicted position covariances (M, 6, K) of ``bank``, grown faster where a track breaks its models.
 
-    P(tau) -> P_0 + factor (P(tau) - P_0), P_0 that of the last update.
+    P(tau) -> P_0 + factor (P(tau) - P_0), P_0 that of the last update, at the instants at which every axis has grown;
+    going back in time (a stamp ahead of the prediction's start) nothing is widened.
     """
     factor = growth_factor(bank.means, constants.watch)
     agile = np.flatnonzero(factor > 1.0)
@@ -234,6 +235,8 @@ def widened(spread: FloatArray, bank: Bank, constants: Constants) -> FloatArray:
     offset = p - weights @ p
     second = bank.covariance[agile, :, P, P] + offset[..., :, None] * offset[..., None, :]
     base = (weights @ second.reshape(-1, MODELS, 9))[:, 0, _ENTRIES, None]
+    growth = spread[agile] - base
+    growth *= growth[:, :3].min(axis=1, keepdims=True) > 0.0
     spread = spread.copy()
-    spread[agile] = base + factor[agile, None, None] * (spread[agile] - base)
+    spread[agile] += (factor[agile, None, None] - 1.0) * growth
     return spread

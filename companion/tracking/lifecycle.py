@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from companion.tracking.imm import fuse_mean
-from companion.tracking.tracks import BoolArray, Rows, Sightings, Tracks
+from companion.tracking.tracks import COAST_MIN_NS, BoolArray, Rows, Sightings, Tracks
 from companion.types import Vec3
 
 
@@ -28,13 +28,25 @@ def expire(tracks: Tracks, now_ns: int, coast_ns: int, counts: Counter[str], *, 
         if spare_trusted:
             gone &= ~tracks.trusted
         tracks = _without(tracks, gone, counts, lost="lost")
+    return _without_old_keys(tracks, now_ns - coast_ns, spare_trusted=spare_trusted)
+
+
+def forget(tracks: Tracks, oldest_ns: int, counts: Counter[str]) -> Tracks:
+    """Without the tracks and keys that were not seen since ``oldest_ns``, whatever the frames said."""
+    gone = tracks.stamp_ns < oldest_ns
+    if gone.any():
+        tracks = _without(tracks, gone, counts, lost="lost")
+    return _without_old_keys(tracks, oldest_ns, spare_trusted=False)
+
+
+def _without_old_keys(tracks: Tracks, oldest_ns: int, *, spare_trusted: bool) -> Tracks:
     keys = tracks.keys
-    if len(keys.names) > len(tracks) and keys.seen_ns.min() < now_ns - coast_ns:
-        fresh = keys.seen_ns >= now_ns - coast_ns
-        if spare_trusted:
-            fresh |= tracks.trusted[keys.row]
-        tracks = replace(tracks, keys=keys.take(np.flatnonzero(fresh)))
-    return tracks
+    if len(keys.names) == len(tracks) or keys.seen_ns.min() >= oldest_ns:
+        return tracks
+    fresh = keys.seen_ns >= oldest_ns
+    if spare_trusted:
+        fresh |= tracks.trusted[keys.row]
+    return replace(tracks, keys=keys.take(np.flatnonzero(fresh)))
 
 
 def confirm(
@@ -42,13 +54,17 @@ def confirm(
 ) -> Tracks:
     """Tentative tracks after a frame of ``source``: hits of those ``used``, and a chance less for its own.
 
+    Hits are counted from new looks of the source that began the track, so that two sensors of one instant do not
+    confirm it for each other; those of others count once it is `COAST_MIN_NS` old, should its own source fall silent.
+
     Args:
         new_look: the frame is the first of its source with this stamp; only then it takes a chance.
     """
     if tracks.confirmed.all():
         return tracks
     hits, chances = tracks.hits.copy(), tracks.chances.copy()
-    hits[used] += 1
+    counted = (tracks.home[used] == source) & new_look | (stamp_ns - tracks.born_ns[used] >= COAST_MIN_NS)
+    hits[used[counted]] += 1
     confirmed = tracks.confirmed | (hits >= confirm_hits)
     if new_look:
         chances[(tracks.home == source) & (tracks.born_ns < stamp_ns)] -= 1

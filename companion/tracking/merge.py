@@ -2,12 +2,14 @@
 
 Two tracks may be the same obstacle while no source has seen both at one stamp. They agree at an instant where
 
-    |dp| <= r_1 + r_2                                two solid spheres never come closer than that,
+    |dp| + sigma / 2 <= r_1 + r_2                    two solid spheres never come closer than that,
     dx^T (P_1 + P_2)^-1 dx <= 16.81                  position and velocity, 99 % of chi-squared with 6 degrees,
 
-and are merged when they have agreed at every check for `merge_s`. Tracks of one obstacle share its process noise, so
-their difference is smaller than P_1 + P_2 says: such a pair passes more often than in 99 %; what keeps two obstacles
-two is that they do not touch, for long. Where one track agrees with two that are told apart, the nearer gets it.
+sigma being the largest of P_1 + P_2 in position, and are merged when they have agreed at every check for `merge_s`:
+where sensors are too coarse to tell that the two would touch, they stay two. Tracks of one obstacle share its process
+noise, so their difference is smaller than P_1 + P_2 says and such a pair passes more often than in 99 %; what keeps
+two obstacles two is that they do not touch, for long. Where one track agrees with two that are told apart, the nearer
+gets it. Trusted and untrusted tracks are checked apart, each by frames of their own.
 Everything here goes by the stamps of frames, so a replay decides the same.
 """
 
@@ -58,11 +60,13 @@ def tell_apart(tracks: Tracks, source: int, stamp_ns: int) -> Tracks:
     return replace(tracks, apart=apart)
 
 
-def merge_agreeing(tracks: Tracks, watch: Watch, stamp_ns: int, merge_s: float, engine: Engine) -> tuple[Tracks, Watch]:
-    """Check the pairs if that is due, and merge those that have agreed for long enough."""
+def merge_agreeing(
+    tracks: Tracks, watch: Watch, stamp_ns: int, merge_s: float, engine: Engine, *, trusted: bool
+) -> tuple[Tracks, Watch]:
+    """Check the pairs of one trust if that is due, and merge those that have agreed for long enough."""
     if watch.checked_ns is not None and stamp_ns - watch.checked_ns < CHECK_NS:
         return tracks, watch
-    recent = tracks.confirmed & (tracks.stamp_ns >= stamp_ns - RECENT_NS)
+    recent = tracks.confirmed & (tracks.trusted == trusted) & (tracks.stamp_ns >= stamp_ns - RECENT_NS)
     row_of = {name: row for row, name in enumerate(tracks.ids)}
     streaks = {pair: streak for pair, streak in watch.streaks.items() if _waits(tracks, recent, row_of, pair)}
     merging: list[tuple[float, tuple[str, str]]] = []
@@ -104,9 +108,10 @@ def agreeing(tracks: Tracks, recent: BoolArray, stamp_ns: int, engine: Engine) -
     involved, place = np.unique(np.concatenate((first, second)), return_inverse=True)
     mean, spread = _carried(tracks, chosen[involved], stamp_ns, engine)
     i, j = place[: first.size], place[first.size :]
-    dx = (mean[i] - mean[j])[:, :6]
-    distance = (dx * np.linalg.solve((spread[i] + spread[j])[:, :6, :6], dx[..., None])[..., 0]).sum(axis=1)
-    touching = np.linalg.norm(dx[:, :3], axis=1) <= radius_m[first] + radius_m[second]
+    dx, both = (mean[i] - mean[j])[:, :6], (spread[i] + spread[j])[:, :6, :6]
+    distance = (dx * np.linalg.solve(both, dx[..., None])[..., 0]).sum(axis=1)
+    sigma = np.sqrt(np.linalg.eigvalsh(both[:, :3, :3])[:, -1])
+    touching = np.linalg.norm(dx[:, :3], axis=1) + 0.5 * sigma <= radius_m[first] + radius_m[second]
     agree = np.flatnonzero(touching & (distance <= DISTANCE_MAX))
     rows = chosen[first[agree]].tolist(), chosen[second[agree]].tolist()
     return list(zip(*rows, distance[agree].tolist(), strict=True))

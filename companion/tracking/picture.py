@@ -30,7 +30,7 @@ class Picture:
     tracks: Tracks
     sources: dict[str, Source] = field(default_factory=dict)
     suspects: Suspects = field(default_factory=dict)
-    watch: Watch = field(default_factory=Watch)
+    watches: tuple[Watch, Watch] = field(default_factory=lambda: (Watch(), Watch()))  # of untrusted, of trusted tracks
     counts: Counter[str] = field(default_factory=Counter)  # detections not used and tracks ended, by reason
 
 

@@ -20,7 +20,7 @@ from companion.tracking.bank import Bank
 from companion.tracking.cycle import Rules, consume
 from companion.tracking.engine import make_engine
 from companion.tracking.imm import fuse, widened
-from companion.tracking.lifecycle import expire
+from companion.tracking.lifecycle import forget
 from companion.tracking.models import shared
 from companion.tracking.ownship import OwnPath
 from companion.tracking.picture import Picture, empty_picture, source_names, statuses
@@ -63,12 +63,11 @@ class Tracker:
     def dropped(self) -> Counter[str]:
         """What was not used, and what ended, by reason.
 
-        Detections: ``late`` (older than the replay buffer, or than their track where there is none), ``duplicate`` (a
+        Detections: ``late`` (older than their track, too late for the replay buffer), ``duplicate`` (a
         stamp seen before), ``outlier`` (far off its track), ``not_finite``, ``own_vehicle`` (the vehicle itself).
         Tracks: ``lost`` (no measurement for ``coast_s``), ``unconfirmed``, ``over_max_tracks``.
         """
         counts = self._picture.counts.copy()
-        counts["late"] += self._replay.late
         hidden = ~self._visible()
         counts["lost"] += int((hidden & self._picture.tracks.confirmed).sum())
         counts["unconfirmed"] += int((hidden & ~self._picture.tracks.confirmed).sum())
@@ -159,9 +158,8 @@ class Tracker:
         return self._horizons[key]
 
     def _visible(self) -> BoolArray:
-        """Tracks that have not coasted too long."""
-        tracks = self._picture.tracks
-        return np.asarray(tracks.stamp_ns + tracks.coast_ns(self._rules.coast_ns) >= self._now_ns)
+        """Tracks with a measurement within ``coast_s``; which coast for less is for the stamps of frames to say."""
+        return np.asarray(self._picture.tracks.stamp_ns >= self._now_ns - self._rules.coast_ns)
 
     def _confirmed(self) -> tuple[Tracks, Bank, Rows]:
         """All tracks, the bank of those that are confirmed and shown, and their rows."""
@@ -172,7 +170,8 @@ class Tracker:
     def _forget(self, picture: Picture) -> Picture:
         """Without the tracks that no frame still admissible could revive."""
         counts = picture.counts.copy()
-        tracks = expire(picture.tracks, self._now_ns - self._replay_ns, self._rules.coast_ns, counts)
+        oldest_ns = self._now_ns - self._replay_ns - self._rules.coast_ns
+        tracks = forget(picture.tracks, oldest_ns, counts)
         return picture if tracks is picture.tracks else replace(picture, tracks=tracks, counts=counts)
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from companion.config import TrackingConfig
 from companion.tracking.bank import Bank, Constants, birth, join
 from companion.tracking.measurement import Measurements
-from companion.types import FloatArray
+from companion.types import NS_PER_S, FloatArray
 
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
@@ -25,6 +25,7 @@ Rows: TypeAlias = npt.NDArray[np.intp]
 Columns: TypeAlias = tuple[Any, ...]  # arrays of one length, in the order of their fields
 Key: TypeAlias = tuple[str, str | None]
 
+COAST_MIN_NS = 3 * NS_PER_S // 10
 NEW = -1  # in place of a row: begins a track
 OURSELVES = -2  # in place of a row: assigned to the vehicle's pseudo-track
 
@@ -97,13 +98,19 @@ class Tracks:
         return _tracks(self.ids, bank, (stamp_ns, *self.columns()[1:]), self.apart, keys)
 
     def coast_ns(self, most_ns: int) -> IntArray:
-        """(M,) how long after its last measurement each track is still one.
+        """(M,) how long after its last measurement each track is still one, by the stamps of frames.
 
-        One that is not settled coasts no longer than twice the time over which it was seen: clutter that looked like an
-        obstacle for two frames is soon gone.
+        One that is not settled coasts no longer than twice the time over which it was seen, and `COAST_MIN_NS` at
+        least: clutter that looked like an obstacle for two frames is soon gone.
         """
-        seen_ns = 2 * (self.stamp_ns - self.born_ns)
+        seen_ns = np.maximum(2 * (self.stamp_ns - self.born_ns), COAST_MIN_NS)
         return np.where(self.settled | ~self.confirmed, most_ns, np.minimum(seen_ns, most_ns))
+
+    def named(self) -> BoolArray:
+        """(M,) whether some source knows the track by an id."""
+        named = np.zeros(len(self), dtype=np.bool_)
+        named[self.keys.row[list(self.keys.index.values())]] = True
+        return named
 
     def radius_m(self) -> FloatArray:
         """(M,) the largest of the newest radii that each track's keys state."""

@@ -96,3 +96,8 @@ def test_hash_sees_every_value_but_the_log() -> None:
 def test_default_file_is_the_defaults() -> None:
     """configs/default.toml documents every default; it must not drift from the code."""
     assert load_config(ROOT / "configs" / "default.toml") == Config()
+
+
+def test_a_confirmation_that_can_never_come_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"tracking\.confirm_hits: expected at most confirm_frames \+ 1 = 4, got 5"):
+        parse_config({"tracking": {"confirm_hits": 5, "confirm_frames": 3}})

@@ -355,3 +355,61 @@ def test_a_foreign_track_cannot_make_the_merged_one_much_surer_than_our_own_dete
     assert joined.table().ids == ("cam/a",)
     mine, both = (np.trace(tracker.table().covariance[0, :3, :3]) for tracker in (alone, joined))
     assert both > 0.6 * mine
+
+
+@pytest.mark.parametrize("apart_s", [0.0, 0.002, 0.005, 0.02])
+@pytest.mark.parametrize("latency_s", [0.0, 0.05, 0.3])
+@pytest.mark.parametrize("rate_hz", [20.0, 2.0])
+def test_two_sensors_of_one_instant_see_an_anonymous_obstacle(apart_s, latency_s, rate_hz):
+    """Neither confirms it for the other at once; with the second look of the first it is a track and stays one."""
+    tracker, names, step_s = Tracker(TrackingConfig()), [], 1.0 / rate_hz
+    for k in range(12):
+        t_s = 1.0 + step_s * k
+        left = frame(t_s, seen(None, [3.0, 0.0, 1.0]), source="left", sequence=k)
+        right = frame(t_s + apart_s, seen(None, [3.0, 0.0, 1.0]), source="right", sequence=k)
+        now_ns = round((t_s + apart_s + latency_s) * S)
+        tracker.update([left, right], now_ns)
+        names.append(tracker.predict(now_ns, 3, 0.05).ids)
+    assert names[0] == ()
+    assert set(names[1:]) == {("left/#1",)}
+
+
+def test_an_anonymous_obstacle_is_confirmed_by_another_source_when_its_own_falls_silent():
+    tracker = Tracker(TrackingConfig())
+    give(tracker, frame(0.0, seen(None, [3.0, 0.0, 1.0]), source="left"))
+    for k in range(1, 10):
+        give(tracker, frame(STEP_S * k, seen(None, [3.0, 0.0, 1.0]), source="right", sequence=k))
+    assert tracker.table().status == ("confirmed",)
+
+
+def test_a_named_track_between_two_frames_is_not_carried_off():
+    """The camera names its obstacle twice a second; a lidar sees only another one, two metres away."""
+    tracker, rng = Tracker(TrackingConfig()), np.random.default_rng(3)
+    for k in range(100):
+        t_s, frames = STEP_S * k, []
+        if k % 10 == 0:
+            frames.append(frame(t_s, seen("a", rng.normal(scale=0.05, size=3)), sequence=k))
+        other = np.array([2.0, 0.0, 0.0]) + rng.normal(scale=0.05, size=3)
+        frames.append(frame(t_s, seen(None, other), source="lidar", sequence=k))
+        give(tracker, *frames)
+        if k > 15:
+            ahead = tracker.predict(round(t_s * S), 3, 0.05)
+            for truth in ([0.0, 0.0, 0.0], [2.0, 0.0, 0.0]):
+                assert np.linalg.norm(ahead.p_enu[:, 0] - truth, axis=1).min() < 0.7, k
+
+
+def test_untrusted_frames_do_not_hurry_the_merging_of_trusted_tracks():
+    def merged_at(with_net):
+        tracker = Tracker(TrackingConfig(untrusted=("net",)))
+        for k in range(60):
+            t_s = 1.0 + STEP_S * k
+            frames = [frame(t_s - 0.25, seen("a", at(k)), sequence=k)]
+            frames.append(frame(t_s - 0.25, seen("x", at(k)), source="radar", sequence=k))
+            if with_net:
+                frames.append(frame(t_s + 0.09, source="net", sequence=k))
+            tracker.update(frames, round(t_s * S))
+            if k > 3 and len(tracker) == 1:
+                return k
+        return None
+
+    assert merged_at(False) == merged_at(True) is not None

@@ -269,3 +269,30 @@ def test_returned_values_cannot_be_written():
     for array in (table.p_enu, table.covariance, table.radius_m, prediction.p_enu, prediction.sigma_m):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0.0
+
+
+def test_a_stamp_ahead_of_the_prediction_widens_nothing_and_no_variance_is_negative():
+    """Of a jinker, whose predictions grow up to tenfold: going back in time to the start there is nothing to grow."""
+    tracker, rng = Tracker(TrackingConfig()), np.random.default_rng(2)
+    p, v = np.zeros(3), np.array([2.0, 0.0, 0.0])
+    for k in range(200):
+        if k % 20 == 19:
+            v = rng.normal(size=3) * 2.0
+        p = p + 0.05 * v
+        one = frame(0.05 * k + 0.1, seen("j", p + rng.normal(scale=0.05, size=3)), sequence=k)
+        tracker.update([one], round(0.05 * k * S))
+    assert tracker.table().growth[0] > 1.5
+    start_ns = round(0.05 * 199 * S)
+    _, spread = tracker.forecast(start_ns, np.array([0.0, 0.05, 0.08, 0.1, 0.3]))
+    assert (spread[0, :3] > 0.0).all()
+    assert (tracker.predict(start_ns, 5, 0.05).sigma_m > 0.01).all()
+
+
+def test_a_crowd_of_anonymous_detections_is_associated_with_the_nearest():
+    """1024 of them around one track: it keeps to one of the nearest, and the crowd begins tracks up to the bound."""
+    tracker, rng = Tracker(TrackingConfig(max_tracks=16)), np.random.default_rng(5)
+    for k in range(5):
+        crowd = [seen(None, rng.normal(scale=0.1, size=3), std=0.22) for _ in range(1024)]
+        tracker.update([frame(0.05 * k, *crowd, sequence=k)], round(0.05 * k * S))
+    assert len(tracker) == 16
+    assert np.linalg.norm(tracker.table().p_enu, axis=1).max() < 1.0
