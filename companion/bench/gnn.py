@@ -90,7 +90,7 @@ class GnnTracker:
         states = [track.filter.position() for track in self._tracks]
         p = np.array([p for p, _ in states]).reshape(-1, 1, 3)
         spread = np.array([s for _, s in states]).reshape(-1, 1, 3, 3)
-        candidates = Candidates(p, spread, np.ones((len(p), 1)), np.zeros(len(p), dtype=np.bool_))
+        candidates = Candidates(p, spread, np.ones((len(p), 1)), np.full(len(p), np.inf))
         noise = np.broadcast_to(self._noise, (len(z), 3, 3))
         for detection, row in enumerate(associate(z, noise, candidates, self._config.gate_sigma).tolist()):
             if row < 0:

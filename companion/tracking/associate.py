@@ -2,8 +2,12 @@
 
 A track is a mixture of models, and a manoeuvre is what the unlikely one predicts: a detection is gated if any model
 admits it, and priced by the likelihood of the mixture. A track that some source names gets its detections from there;
-what another sees near it must lie within the gate of the fused covariance, or it could be carried off while its own
-source is between two frames.
+what another sees near it must lie within the gate of the fused covariance, and near its body,
+
+    |z - p| <= 2 r + gate sqrt(tr R / 3)
+
+or it could be carried off by another obstacle while its own source is between two frames. What is not taken begins a
+track of its own, and the two are merged when they prove to be one.
 
     d_j^2 = (z - p_j)^T S_j^-1 (z - p_j) <= gate^2 for some j,   S_j = P_j + R
     cost = -2 log sum_j mu_j exp(-d_j^2 / 2) / sqrt(det S_j)
@@ -31,13 +35,13 @@ class Candidates:
     p_enu: FloatArray  # (M, J, 3) [m]
     covariance: FloatArray  # (M, J, 3, 3) [m^2]
     probabilities: FloatArray  # (M, J)
-    named: npt.NDArray[np.bool_]  # (M,)
+    reach_m: FloatArray  # (M,) 2 r of those that some source names, infinite else
 
     def __len__(self) -> int:
         return len(self.p_enu)
 
     def take(self, rows: npt.NDArray[np.intp]) -> Candidates:
-        return Candidates(self.p_enu[rows], self.covariance[rows], self.probabilities[rows], self.named[rows])
+        return Candidates(self.p_enu[rows], self.covariance[rows], self.probabilities[rows], self.reach_m[rows])
 
 
 def associate(z: FloatArray, noise: FloatArray, tracks: Candidates, gate_sigma: float) -> npt.NDArray[np.intp]:
@@ -54,9 +58,9 @@ def associate(z: FloatArray, noise: FloatArray, tracks: Candidates, gate_sigma: 
     squared = (innovation * np.linalg.solve(s, innovation[..., None])[..., 0]).sum(axis=-1)
     mu = np.maximum(tracks.probabilities[track], _MU_MIN)
     likelihood = np.logaddexp.reduce(np.log(mu) - 0.5 * (squared + np.linalg.slogdet(s)[1]), axis=-1)
-    gated = (squared <= gate_sigma**2).any(axis=-1) & (
-        ~tracks.named[track] | _within_fused(innovation, s, tracks.probabilities[track], gate_sigma)
-    )
+    reach = tracks.reach_m[track] + gate_sigma * np.sqrt(np.trace(noise, axis1=1, axis2=2)[detection] / 3.0)
+    gated = (squared <= gate_sigma**2).any(axis=-1)
+    gated &= np.isinf(reach) | _near_body(innovation, s, tracks.probabilities[track], reach, gate_sigma)
     cost = np.full((len(z), len(tracks)), _FORBIDDEN)
     cost[detection[gated], track[gated]] = -2.0 * likelihood[gated]
     for found, row in zip(*linear_sum_assignment(cost), strict=True):
@@ -65,16 +69,16 @@ def associate(z: FloatArray, noise: FloatArray, tracks: Candidates, gate_sigma: 
     return rows
 
 
-def _within_fused(
-    innovation: FloatArray, s: FloatArray, probabilities: FloatArray, gate_sigma: float
+def _near_body(
+    innovation: FloatArray, s: FloatArray, probabilities: FloatArray, reach_m: FloatArray, gate_sigma: float
 ) -> npt.NDArray[np.bool_]:
-    """Whether each pair passes the gate of one Gaussian with the mixture's moments."""
+    """Whether each pair is within reach, and passes the gate of one Gaussian with the mixture's moments."""
     weights = probabilities[..., None]
     mean = (weights * innovation).sum(axis=1)
     off = innovation - mean[:, None]
     fused = (weights[..., None] * (s + off[..., :, None] * off[..., None, :])).sum(axis=1)
     squared = (mean * np.linalg.solve(fused, mean[..., None])[..., 0]).sum(axis=-1)
-    return np.asarray(squared <= gate_sigma**2)
+    return np.asarray((squared <= gate_sigma**2) & (np.linalg.norm(mean, axis=-1) <= reach_m))
 
 
 def _near(
@@ -90,7 +94,7 @@ def _near(
     trace = np.trace(noise, axis1=1, axis2=2)[:, None] + np.trace(tracks.covariance, axis1=2, axis2=3).ravel()
     ratio = ((squared - 1e-6) / trace).reshape(len(z), count, models).min(axis=-1)
     within = ratio <= gate_sigma**2 * (1.0 + 1e-6)
-    if len(z) > CROWD:
+    if np.count_nonzero(within) > CROWD * count:
         within &= ratio <= np.partition(ratio, CROWD - 1, axis=0)[CROWD - 1]
     detection, track = np.nonzero(within)
     return detection, track

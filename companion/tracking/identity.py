@@ -136,7 +136,7 @@ def _predicted(tracks: Tracks, rows: Rows, stamp_ns: int, engine: Engine) -> Can
     bank = tracks.bank.take(rows)
     dt = (stamp_ns - tracks.stamp_ns[rows]) / NS_PER_S
     x, covariance = engine.propagate(bank.x, bank.covariance, dt)
-    return Candidates(x[..., :3], covariance[..., :3, :3], bank.probabilities, tracks.named()[rows])
+    return Candidates(x[..., :3], covariance[..., :3, :3], bank.probabilities, tracks.reach_m()[rows])
 
 
 def _with_ourselves(candidates: Candidates, own: Fix) -> Candidates:
@@ -148,7 +148,7 @@ def _with_ourselves(candidates: Candidates, own: Fix) -> Candidates:
         np.concatenate((candidates.p_enu, p_enu)),
         np.concatenate((candidates.covariance, covariance)),
         np.concatenate((candidates.probabilities, np.full((1, models), 1.0 / models))),
-        np.append(candidates.named, False),
+        np.append(candidates.reach_m, np.inf),
     )
 
 

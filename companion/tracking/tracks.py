@@ -106,11 +106,12 @@ class Tracks:
         seen_ns = np.maximum(2 * (self.stamp_ns - self.born_ns), COAST_MIN_NS)
         return np.where(self.settled | ~self.confirmed, most_ns, np.minimum(seen_ns, most_ns))
 
-    def named(self) -> BoolArray:
-        """(M,) whether some source knows the track by an id."""
-        named = np.zeros(len(self), dtype=np.bool_)
-        named[self.keys.row[list(self.keys.index.values())]] = True
-        return named
+    def reach_m(self) -> FloatArray:
+        """(M,) twice the radius of those that some source knows by an id, infinite for the others."""
+        reach = np.full(len(self), np.inf)
+        named = self.keys.row[list(self.keys.index.values())]
+        reach[named] = 2.0 * self.radius_m()[named]
+        return reach
 
     def radius_m(self) -> FloatArray:
         """(M,) the largest of the newest radii that each track's keys state."""
