@@ -42,16 +42,19 @@ class Keys:
     radius_m: FloatArray  # (K,) newest stated radius
     outlier: BoolArray  # (K,) the newest detection was skipped as an outlier
     outside: IntArray  # (K,) detections outside the gate without one inside since
+    bias: FloatArray  # (K, 3) recent mean of the whitened innovations, kept where a track has several keys
 
     def take(self, chosen: Rows) -> Keys:
         return _keys(tuple([self.names[k] for k in chosen]), *(column[chosen] for column in self.columns()))
 
-    def with_columns(self, *, seen_ns: IntArray, radius_m: FloatArray, outlier: BoolArray, outside: IntArray) -> Keys:
+    def with_columns(
+        self, *, seen_ns: IntArray, radius_m: FloatArray, outlier: BoolArray, outside: IntArray, bias: FloatArray
+    ) -> Keys:
         """The same keys after a frame."""
-        return Keys(self.names, self.index, self.row, self.source, seen_ns, radius_m, outlier, outside)
+        return Keys(self.names, self.index, self.row, self.source, seen_ns, radius_m, outlier, outside, bias)
 
     def columns(self) -> Columns:
-        return self.row, self.source, self.seen_ns, self.radius_m, self.outlier, self.outside
+        return self.row, self.source, self.seen_ns, self.radius_m, self.outlier, self.outside, self.bias
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,7 +156,7 @@ class Origin:
 def no_tracks(constants: Constants) -> Tracks:
     ints, flags = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.bool_)
     rows = np.zeros(0, dtype=np.intp)
-    keys = Keys((), {}, rows, rows, ints, np.zeros(0), flags, ints)
+    keys = Keys((), {}, rows, rows, ints, np.zeros(0), flags, ints, np.zeros((0, 3)))
     bank = birth(np.zeros((0, 3)), np.zeros((0, 3, 3)), constants)
     columns = ints, ints, rows, ints, ints, flags, flags, flags, flags
     return _tracks((), bank, columns, np.zeros((0, 0), dtype=np.bool_), keys)
@@ -199,6 +202,7 @@ def first_keys(found: Sightings, rows: Rows, source: int, stamp_ns: int) -> Keys
         found.measurements.radius_m,
         np.zeros(count, dtype=np.bool_),
         np.zeros(count, dtype=np.int64),
+        np.zeros((count, 3)),
     )
 
 

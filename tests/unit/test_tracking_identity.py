@@ -413,3 +413,21 @@ def test_untrusted_frames_do_not_hurry_the_merging_of_trusted_tracks():
         return None
 
     assert merged_at(False) == merged_at(True) is not None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_padded_obstacles_taken_for_one_part_before_they_are_a_metre_apart(seed):
+    """Radii of 1 m, centres 0.3 m apart at sigma 0.22 m: one, by the rules. They part at 0.5 m/s: two, soon."""
+    tracker, rng = Tracker(TrackingConfig()), np.random.default_rng(seed)
+    merged = False
+    for k in range(300):
+        t_s = STEP_S * k
+        gap = 0.3 + max(0.0, t_s - 8.0) * 0.5
+        one, other = np.zeros(3), np.array([gap, 0.0, 0.0])
+        for source, p in (("cam", one), ("radar", other)):
+            noisy = seen("a", p + rng.normal(scale=0.22, size=3), std=0.22, radius=1.0)
+            give(tracker, frame(t_s, noisy, source=source, sequence=k))
+        merged = merged or len(tracker) == 1
+        if gap > 1.0:
+            assert len(tracker) == 2, gap
+    assert merged, "else this test says nothing"
