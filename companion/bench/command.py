@@ -27,6 +27,9 @@ from those that anything was tuned on. filterpy is part of the dev extra; withou
 """
 
 
+TICKS = 1000  # timed with one and ten obstacles, a tenth with a hundred
+
+
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """The `bench` command with one subcommand a part."""
     bench = commands.add_parser(
@@ -66,8 +69,7 @@ def _tracking(arguments: argparse.Namespace) -> int:
         if not filterpy:
             print("companion: bench tracking: --tune-rivals needs filterpy (the dev extra)", file=sys.stderr)
             return 2
-        _print_json(tracking.tune_rivals(tracking.TRIALS))
-        return 0
+        return _tune_rivals()
     trials = 4 if arguments.quick else tracking.TRIALS
     cells = list(tracking.HEADLINE) if arguments.quick else tracking.cells(every=arguments.all)
     seeds = tracking.CROSSING_SEEDS[:1] if arguments.quick else tracking.CROSSING_SEEDS
@@ -83,7 +85,7 @@ def _tracking(arguments: argparse.Namespace) -> int:
         crossings[seed] = tracking.measure_crossing(seed, filterpy=filterpy)
 
     def measure_times() -> None:
-        times.extend(tracking.measure_times(filterpy=filterpy, repeats=100 if arguments.quick else 400))
+        times.extend(tracking.measure_times(filterpy=filterpy, repeats=TICKS))
 
     jobs: list[tuple[str, Callable[[], None]]] = [("time", measure_times)]  # first, while nothing else is warm
     jobs += [(cell.name, partial(measure_cell, cell)) for cell in cells]
@@ -94,6 +96,15 @@ def _tracking(arguments: argparse.Namespace) -> int:
         _print_json(envelope("tracking", tracking.as_json(results, crossings, times), figures))
     else:
         print_tracking(results, crossings, times, figures)
+    return 0
+
+
+def _tune_rivals() -> int:
+    from companion.bench import tracking
+
+    found: dict[str, Any] = {}
+    _run([("the rivals' process noises", lambda: found.update(tracking.tune_rivals(tracking.TRIALS)))])
+    _print_json(found)
     return 0
 
 

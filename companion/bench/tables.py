@@ -128,13 +128,18 @@ def _time_table(times: list[Timing]) -> Table:
         "p99",
         "times faster",
     )
+    table.caption = "-: too few samples"
     for timing in times:
         both, theirs = timing.both, timing.filterpy
         ours = (timing.update.p50, timing.predict.p50, both.p50, both.p99, both.p999, both.max)
-        rival = ("-", "-") if theirs is None else (f"{theirs.p50:.3f}", f"{theirs.p99:.3f}")
+        rival = (None, None) if theirs is None else (theirs.p50, theirs.p99)
         speed_up = "-" if timing.speed_up is None else f"{timing.speed_up:.0f}"
-        table.add_row(str(timing.obstacles), *(f"{value:.3f}" for value in ours), *rival, speed_up)
+        table.add_row(str(timing.obstacles), *(_milliseconds(value) for value in (*ours, *rival)), speed_up)
     return table
+
+
+def _milliseconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
 
 
 def _figure_table(figures: list[Figure]) -> Table:

@@ -1,6 +1,6 @@
 """Which track a detection belongs to: a named one by its key, anonymous ones by the cheapest assignment of all.
 
-Where the frame's source has reported the vehicle itself within the last second, the vehicle takes part in the
+Where the frame's source has reported the vehicle itself lately, the vehicle takes part in the
 assignment as a pseudo-track, so that its detection cannot pull an obstacle's track.
 """
 

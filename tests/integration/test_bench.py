@@ -31,6 +31,7 @@ def test_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str])
     assert all(len(scores["ahead_0.25_m"]) == 9 for scores in cell["filters"].values())
     assert set(told["results"]["crossing"]["3"]) == {"ours", "paper", "CV only", "CA only", "filterpy IMM"}
     assert [timing["obstacles"] for timing in told["results"]["timing_ms"]] == [100, 1000]
+    assert all(timing["both"]["p99"] is None for timing in told["results"]["timing_ms"]), "three samples tell none"
     assert {figure["relation"] for figure in told["figures"]} == {"at most", "at least"}
     assert told["results"]["seeds"]["report"] != told["results"]["seeds"]["tuning"]
 
@@ -51,6 +52,19 @@ def test_tuning_without_filterpy_is_wrong_usage(
     monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: None)
     assert main(["bench", "tracking", "--tune-rivals"]) == 2
     assert "filterpy" in capsys.readouterr().err
+
+
+def test_tuning_runs_under_the_progress_bar_and_prints_one_object(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs: list[str] = []
+    run = command._run
+    monkeypatch.setattr(command, "_run", lambda told: (jobs.extend(name for name, _ in told), run(told)))
+    monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(tracking, "tune_rivals", lambda trials: {"CV_PSD": 1.0})
+    assert main(["bench", "tracking", "--tune-rivals"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"CV_PSD": 1.0}
+    assert jobs == ["the rivals' process noises"]
 
 
 def test_help_shows_an_example(capsys: pytest.CaptureFixture[str]) -> None:

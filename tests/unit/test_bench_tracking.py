@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from companion.bench import accuracy, crossing, tracking
+from companion.bench import accuracy, crossing, timing, tracking
 from companion.bench.accuracy import CHI2_95, Cell, draw_trials, hindsight, track, track_filterpy, track_single
 from companion.bench.crossing import draw_crossing, judge
 from companion.bench.envelope import Figure, envelope
 from companion.bench.gnn import GnnTracker, OneModel
 from companion.bench.motions import MOTIONS
 from companion.bench.rivals import SingleModel, chain, chain_of_axes
-from companion.bench.timing import measure_timing
+from companion.bench.tables import print_tracking
+from companion.bench.timing import Quantiles, Timing, measure_timing, quantiles
 from companion.config import TrackingConfig
 
 CELL = Cell(0.05, 20.0)
@@ -157,6 +158,53 @@ def test_the_plain_tracker_keeps_two_far_obstacles_apart():
     for k in range(40, 70):
         ids, _ = plain.frame(np.zeros((0, 3)), k)
     assert ids == []
+
+
+def test_confirmed_tracks_of_the_plain_tracker_choose_first():
+    """A tentative track nearer to the only detection does not take it from the confirmed one."""
+    plain = GnnTracker(lambda z: OneModel(2, 1.0, z, 0.05), rate_hz=20.0, std_m=0.05)
+    for k in range(20):
+        plain.frame(np.zeros((1, 3)), k)
+    ids, _ = plain.frame(np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]]), 20)
+    assert ids == ["#1"]
+    ids, _ = plain.frame(np.array([[0.15, 0.0, 0.0]]), 21)
+    assert ids == ["#1"]
+    assert plain._tracks[0].last == 21
+
+
+@pytest.mark.parametrize(("frames", "coasted"), [(2, 6), (6, 10), (40, 20)])
+def test_the_plain_tracker_coasts_as_ours(frames, coasted):
+    """max(0.3 s, twice the time over which it was seen), at most a second."""
+    plain = GnnTracker(lambda z: OneModel(2, 1.0, z, 0.05), rate_hz=20.0, std_m=0.05)
+    for k in range(frames):
+        plain.frame(np.zeros((1, 3)), k)
+    shown = [bool(plain.frame(np.zeros((0, 3)), k)[0]) for k in range(frames, frames + 40)]
+    assert shown == [True] * coasted + [False] * (40 - coasted)
+
+
+def test_quantiles_of_too_few_samples_are_not_told(capsys):
+    few, some, many = (quantiles([1_000_000] * count) for count in (99, 100, 1000))
+    assert (few.p99, few.p999) == (None, None)
+    assert (some.p99, some.p999) == (1.0, None)
+    assert many == Quantiles(1.0, 1.0, 1.0, 1.0)
+    print_tracking([], {}, [Timing(1, few, few, few, few)], [])
+    row = next(line for line in capsys.readouterr().out.splitlines() if "1.000" in line)
+    assert row.count(" - ") == 3
+
+
+def test_filterpy_is_timed_on_some_of_the_ticks(monkeypatch):
+    pytest.importorskip("filterpy")
+    monkeypatch.setattr(timing, "FILTERPY_UPDATES", 20)
+    monkeypatch.setattr(timing, "FILTERPY_TICKS", 5)
+    looped = []
+    monkeypatch.setattr(timing, "_loop_ns", lambda estimators, z: looped.append(len(z)) or 1_000_000)
+    assert measure_timing(2, 40, filterpy=True).filterpy.p50 == 1.0
+    assert looped == [2] * (5 + 10)
+
+
+def test_without_git_there_is_no_commit(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert envelope("tracking", {}, [])["commit"] is None
 
 
 def test_figures_are_met_or_missed():

@@ -7,7 +7,17 @@ import pytest
 from tracking_scenes import S, assert_same_bits, beside, frame, give, seen, vehicle
 
 from companion.config import TrackingConfig
-from companion.tracking.ownship import MEMORY_NS, PATH_NS, OwnPath, weigh
+from companion.tracking.ownship import (
+    MEMORY_MAX_NS,
+    MEMORY_NS,
+    PATH_NS,
+    PERIODS,
+    VARIANCE_MIN_M2,
+    Fix,
+    OwnPath,
+    residuals,
+    weigh,
+)
 from companion.tracking.tracker import Tracker
 
 STEP_S = 0.05
@@ -218,16 +228,119 @@ def test_the_path_is_interpolated_carried_on_and_bounded():
     assert path.at(round(1.71 * S)) is None
     path.note(vehicle(3.0, [4.0, 0.0, 1.0]))
     assert path.at(S // 10) is None
+    path.note(vehicle(3.1, [4.0, 0.0, 1.0], p_std_m=0.31))
+    assert path.at(31 * S // 10) is None, "too vague to tell anything"
+    path.reset()
+    path.note(vehicle(1.4, [3.0, 0.0, 1.0]))
+    path.note(vehicle(3.0, [4.0, 0.0, 1.0]))
     assert len(path._states) == 2
     assert PATH_NS == 2 * S
 
 
-def test_old_evidence_is_forgotten_and_recent_counts_most():
-    r, inverse = np.zeros(3), np.eye(3) / 0.05**2
-    evidence = weigh(None, r, inverse, 0.0, 0, 0.2)
-    for k in range(1, 60):
-        evidence = weigh(evidence, r, inverse, 0.0, k * S // 20, 0.2)
-    assert evidence.count == 60
-    assert np.trace(evidence.information) == pytest.approx(20.0 * np.trace(inverse), rel=0.02)
-    assert weigh(evidence, r, inverse, 0.0, evidence.seen_ns + MEMORY_NS + 1, 0.2).count == 1
-    assert weigh(None, r, inverse, 26.0, 0, 0.2) is None
+def vague(t_s, k, offset, *, std, p_std_m=0.0, name="ball", rng):
+    """A frame with something ``offset`` m from the hovering vehicle, and the vehicle's state then."""
+    z = beside(HOVER, offset) + rng.normal(scale=std, size=3)
+    return frame(t_s, seen(name, z, std=std), sequence=k), vehicle(t_s, HOVER, p_std_m=p_std_m)
+
+
+def shown_at(offset, *, std, p_std_m=0.0, name="ball", rate_hz=20.0, count=40, seed=0):
+    """Number of each detection after which an obstacle is predicted."""
+    tracker, rng = Tracker(TrackingConfig()), np.random.default_rng(seed)
+    tracker.note_vehicle(vehicle(-STEP_S, HOVER, p_std_m=p_std_m))
+    shown = []
+    for k in range(count):
+        look, state = vague(k / rate_hz, k, offset, std=std, p_std_m=p_std_m, name=name, rng=rng)
+        tracker.note_vehicle(vehicle(k / rate_hz - 0.1, HOVER, p_std_m=p_std_m))
+        give(tracker, look)
+        tracker.note_vehicle(state)
+        shown += [k] if len(tracker.predict(look.stamp_ns, 3, STEP_S)) else []
+    return shown
+
+
+@pytest.mark.parametrize("name", ["ball", None])
+@pytest.mark.parametrize("far", [0.5, 1.0, 2.0])
+def test_an_own_position_too_vague_to_tell_hides_no_obstacle(name, far):
+    for seed in range(5):
+        first = shown_at(far, std=0.05, p_std_m=far, name=name, seed=seed)[0]
+        assert first <= (0 if name else 1), "an anonymous one needs two hits"
+
+
+@pytest.mark.parametrize("offset", [0.5, 1.5, 4.0])
+@pytest.mark.parametrize("std", [2.0, 5.0])
+def test_a_sensor_too_coarse_to_tell_hides_no_obstacle(std, offset):
+    for seed in range(5):
+        assert shown_at(offset, std=std, seed=seed) == list(range(40))
+
+
+@pytest.mark.parametrize(("std", "offset"), [(0.5, 0.9), (0.9, 1.0)])
+def test_a_mean_that_cannot_tell_after_the_grace_hides_no_obstacle(std, offset):
+    shown = [shown_at(offset, std=std, seed=seed)[0] for seed in range(20)]
+    assert sum(first <= 10 for first in shown) >= 18
+    assert max(shown) <= 20
+
+
+def test_a_slow_source_sums_evidence_and_the_verdict_outlives_its_track():
+    """At 0.9 Hz a track ends before the next detection: every one is a birth."""
+    for seed in range(20):
+        shown = shown_at(0.8, std=0.22, rate_hz=0.9, count=20, seed=seed)
+        assert shown[0] <= 2
+        assert shown[1:] == list(range(shown[1], 20))
+
+
+def test_a_constant_error_within_our_hull_is_still_us():
+    for seed in range(3):
+        assert shown_at(0.15, std=0.22, count=600, seed=seed) == []
+        assert shown_at(0.19, std=0.05, count=600, seed=seed) == []
+
+
+def test_what_leaves_us_after_a_long_time_is_soon_told_apart():
+    tracker, rng = Tracker(TrackingConfig()), np.random.default_rng(0)
+
+    def look(k, own):
+        away = 0.0 if k < 600 else min(0.05 * (k - 600), 0.8)
+        return [seen("other", beside(own, away) + rng.normal(scale=0.22, size=3), std=0.22)]
+
+    shown = [k for k in fly(tracker, hovering, 0, 680, look) if len(tracker) and k > 1]
+    assert 600 < shown[0] < 630
+    assert shown == list(range(shown[0], 680))
+
+
+def test_the_vehicle_born_while_its_position_was_vague_is_recognised_later():
+    tracker = Tracker(TrackingConfig())
+    for k in range(40):
+        tracker.note_vehicle(vehicle(STEP_S * k - 0.01, HOVER, p_std_m=0.5 if k < 20 else 0.1))
+        give(tracker, frame(STEP_S * k, seen("drone", HOVER), sequence=k))
+        assert len(tracker) == (k < 20)
+
+
+def test_the_own_position_counts_once_and_is_not_averaged_away():
+    own = Fix(np.zeros(3), 0.2**2 + VARIANCE_MIN_M2)
+    (one,) = residuals(np.zeros((1, 3)), 0.01 * np.eye(3)[None], own)
+    evidence = None
+    for k in range(500):
+        evidence = weigh(evidence, one, k * S // 20, 0.2)
+    _, spread = evidence.whole.moments()
+    np.testing.assert_allclose(spread, (0.2**2 + (0.01 + VARIANCE_MIN_M2) / 500) * np.eye(3), atol=1e-12)
+
+
+def test_evidence_lasts_some_intervals_of_its_key():
+    (one,) = residuals(np.zeros((1, 3)), 0.01 * np.eye(3)[None], Fix(np.zeros(3), VARIANCE_MIN_M2))
+    for interval_ns, lasts_ns in ((S // 20, S), (2 * S, PERIODS * 2 * S), (4 * S, MEMORY_MAX_NS)):
+        first = weigh(None, one, 0, 0.2)
+        assert first.sums(MEMORY_MAX_NS)
+        assert not first.lives(MEMORY_NS + 1)
+        second = weigh(first, one, interval_ns, 0.2)
+        assert second.count == 2
+        assert weigh(second, one, interval_ns + lasts_ns, 0.2).count == 3
+        assert weigh(second, one, interval_ns + lasts_ns + 1, 0.2).count == 1
+
+
+def test_the_recent_mean_is_bounded_and_the_whole_is_not():
+    (one,) = residuals(np.zeros((1, 3)), 0.01 * np.eye(3)[None], Fix(np.zeros(3), VARIANCE_MIN_M2))
+    evidence = None
+    for k in range(100):
+        evidence = weigh(evidence, one, k * S // 20, 0.2)
+    assert np.trace(evidence.whole.information) == pytest.approx(100.0 * np.trace(one.inverse))
+    assert np.trace(evidence.recent.information) == pytest.approx(20.0 * np.trace(one.inverse), rel=0.02)
+    (far,) = residuals(np.full((1, 3), 9.0), 0.01 * np.eye(3)[None], Fix(np.zeros(3), VARIANCE_MIN_M2))
+    assert weigh(None, far, 0, 0.2) is None
