@@ -98,6 +98,7 @@ def test_arm_take_off_hold_land_and_disarm(simulator: Any) -> None:
             assert home.latitude_deg == pytest.approx(47.397742, abs=1e-6)
             assert not (await until(telemetry.subscribe_in_air(), lambda x: True))[-1]
 
+            await asyncio.sleep(0)  # the task subscribes before the autopilot has anything to say
             with pytest.raises(Exception, match="DENIED"):
                 await action.takeoff()  # not armed
             await action.arm()
