@@ -3,9 +3,9 @@
 A detection farther than `jump_sigma` off is skipped once. A second time running the track restarts there, if the key
 is its only one; else the key leaves it and begins its own track there, as it does after five detections running
 outside `gate_sigma`, or when its detections are off on the mean: with w = L^-1 (z - p), S = L L^T, the whitened
-innovations of one key against the fused track, and b their mean over the last `BIAS_DETECTIONS`,
+innovations of one key against the fused track, and b their exponential mean with the gain 1 / `BIAS_DETECTIONS`,
 
-    BIAS_DETECTIONS |b|^2 > 5^2      three degrees of freedom: by chance once in 60 000.
+    BIAS_DETECTIONS |b|^2 > 5^2      b ~ N(0, I / 19) where all keys see one obstacle.
 
 Then the sources do not see the same obstacle, and the one track would fly between the two.
 """

@@ -42,7 +42,7 @@ class Keys:
     radius_m: FloatArray  # (K,) newest stated radius
     outlier: BoolArray  # (K,) the newest detection was skipped as an outlier
     outside: IntArray  # (K,) detections outside the gate without one inside since
-    bias: FloatArray  # (K, 3) recent mean of the whitened innovations, kept where a track has several keys
+    bias: FloatArray  # (K, 3) exponential mean of the whitened innovations, kept where a track has several keys
 
     def take(self, chosen: Rows) -> Keys:
         return _keys(tuple([self.names[k] for k in chosen]), *(column[chosen] for column in self.columns()))
