@@ -52,6 +52,15 @@ class FilterInput:
     elapsed_s: float | None = None  # vehicle time since the last call, None on the first
 
 
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What `SafetyFilter.solve` found, before its verdict."""
+
+    found: Found
+    values: FloatArray  # (2, M, R) the true rows there: rise and psi
+    verdict: Verdict  # nominal, adjusted or braking
+
+
 class SafetyFilter:
     """Admissible accelerations, tick by tick. Hidden state: the last answer and each obstacle's epsilon."""
 
@@ -68,23 +77,19 @@ class SafetyFilter:
         self._epsilon: dict[str, float] = {}
 
     def step(self, inputs: FilterInput) -> FilterResult:
-        """The safe acceleration for one tick; never raises on finite input.
+        """The safe acceleration for one tick: build, solve, verify; never raises on finite input.
 
         Raises:
             ValueError: the prediction is shorter than horizon + 3 instants.
         """
-        task = self._task(inputs)
-        values = task.rows.evaluate(inputs.a_ref)
-        lower, upper = decay_interval(values, task.rows.least_decay)
-        if bool((lower <= upper).all()) and task.limits.admits(inputs.a_ref):
-            found = Found(inputs.a_ref, lower / self._safety.alpha2, True, 0.0, 0, "none")
-            return self._answer(task, found, values, Verdict.NOMINAL)
-        task = replace(task, budget=self._budget(task, inputs.elapsed_s or 0.0))
-        found, values, fallback = self._solve(task)
-        return self._answer(task, found, values, Verdict.BRAKING if fallback else Verdict.ADJUSTED)
+        task = self.build(inputs)
+        return self.verify(task, self.solve(task, inputs.elapsed_s or 0.0))
 
-    def _task(self, inputs: FilterInput) -> Task:
-        """The problem, its CLF without a budget as yet: a reference that passes needs none."""
+    def build(self, inputs: FilterInput) -> Task:
+        """The tick's problem: rows, limits and epsilon*, from which tests can read every matrix.
+
+        Its CLF has no budget as yet: a reference that passes needs none.
+        """
         config, prediction = self._safety, inputs.prediction
         rows = self._barrier.rows(inputs.p_enu, inputs.v_enu, prediction, inputs.p_std_m)
         limits = vehicle_limits(
@@ -98,6 +103,14 @@ class SafetyFilter:
         star = epsilon_star(-rows.drift[:, :, 0].T, prediction.v_enu - inputs.v_enu, config)
         return Task(rows, limits, inputs.a_ref, star, star, config)
 
+    def solve(self, task: Task, elapsed_s: float) -> Answer:
+        """The reference where it is admissible, else the search's answer, as yet unjudged."""
+        values = task.rows.evaluate(task.a_ref)
+        lower, upper = decay_interval(values, task.rows.least_decay)
+        if bool((lower <= upper).all()) and task.limits.admits(task.a_ref):
+            return Answer(Found(task.a_ref, lower / self._safety.alpha2, True, 0.0, 0, "none"), values, Verdict.NOMINAL)
+        return self._search(replace(task, budget=self._budget(task, elapsed_s)))
+
     def _budget(self, task: Task, elapsed_s: float) -> FloatArray:
         """What the CLF leaves each obstacle; one without history starts from the greatest epsilon."""
         ids, config = task.rows.ids, self._safety
@@ -105,28 +118,29 @@ class SafetyFilter:
         elapsed = np.array([elapsed_s if name in self._epsilon else 0.0 for name in ids])
         return clf_budget(previous, task.star, elapsed, config.eta)
 
-    def _solve(self, task: Task) -> tuple[Found, FloatArray, bool]:
-        """The answer with epsilons of all obstacles, the rows there, and whether it had to do without solvers."""
+    def _search(self, task: Task) -> Answer:
+        """The answer with epsilons of all obstacles."""
         near = within_reach(task.rows, task.limits)
         rows = task.rows if near.all() else task.rows.select(near)
         a_ref = turned(rows, task.a_ref)
         reduced = Task(rows, task.limits, a_ref, task.star[near], task.budget[near], task.config)
         try:
-            found, fallback = solve_task(reduced, self._last, self._order), False
+            found, verdict = solve_task(reduced, self._last, self._order), Verdict.ADJUSTED
         except SolverError:
-            found, fallback = braking(reduced, self._last), True
+            found, verdict = braking(reduced, self._last), Verdict.BRAKING
         values = task.rows.evaluate(found.a)
         if rows is task.rows:
-            return found, values, fallback
+            return Answer(found, values, verdict)
         lower, upper = decay_interval(values, task.rows.least_decay)
         epsilon = np.minimum(np.maximum(task.star, lower / self._safety.alpha2), upper / self._safety.alpha2)
         epsilon[near] = found.epsilon
-        return replace(found, epsilon=epsilon), values, fallback
+        return Answer(replace(found, epsilon=epsilon), values, verdict)
 
-    def _answer(self, task: Task, found: Found, values: FloatArray, verdict: Verdict) -> FilterResult:
-        """The record: the true rows at the answer decide between adjusted and relaxed."""
-        a, rows = found.a, task.rows
-        obstacles = _worst_rows(task, found, values)
+    def verify(self, task: Task, answer: Answer) -> FilterResult:
+        """The verdict and the record: the true rows at the answer decide between adjusted and relaxed."""
+        found, verdict, rows = answer.found, answer.verdict, task.rows
+        a = found.a
+        obstacles = _worst_rows(task, found, answer.values)
         slacks = task.limits.slacks(a)
         limits = [
             RowRecord(track=name, step=-1, slack=slack, margin=None, epsilon=0.0, epsilon_star=0.0)

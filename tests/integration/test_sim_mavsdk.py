@@ -84,6 +84,21 @@ async def until(stream: Any, accept: Callable[[Any], bool], limit_s: float = 20.
     return seen
 
 
+def in_order(names: Iterator[str]) -> Callable[[Any], bool]:
+    """Takes the update at which the last of ``names`` is seen, each after the one before."""
+    awaited = next(names)
+
+    def accept(update: Any) -> bool:
+        nonlocal awaited
+        if update.name != awaited:
+            return False
+        following = next(names, None)
+        awaited = awaited if following is None else following
+        return following is None
+
+    return accept
+
+
 def test_arm_take_off_hold_land_and_disarm(simulator: Any) -> None:
     from mavsdk.asyncio.plugins.action import ActionAsync
     from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
@@ -98,16 +113,16 @@ def test_arm_take_off_hold_land_and_disarm(simulator: Any) -> None:
             assert home.latitude_deg == pytest.approx(47.397742, abs=1e-6)
             assert not (await until(telemetry.subscribe_in_air(), lambda x: True))[-1]
 
-            await asyncio.sleep(0)  # the task subscribes before the autopilot has anything to say
             with pytest.raises(Exception, match="DENIED"):
                 await action.takeoff()  # not armed
             await action.arm()
-            await until(telemetry.subscribe_armed(), bool, 1.0)
+            await until(telemetry.subscribe_armed(), bool)
+            wanted = iter((TAKEOFF_MODE, HOLD))
+            modes = asyncio.create_task(until(telemetry.subscribe_flight_mode(), in_order(wanted)))
+            await asyncio.sleep(0)  # the task subscribes before the mode changes
             await action.takeoff()
-            await until(telemetry.subscribe_flight_mode(), lambda m: m.name == TAKEOFF_MODE, 1.0)
             await until(telemetry.subscribe_in_air(), bool)
-            modes = await until(telemetry.subscribe_flight_mode(), lambda m: m.name == HOLD)
-            assert {m.name for m in modes} <= {TAKEOFF_MODE, HOLD}
+            assert {mode.name for mode in await modes} <= {TAKEOFF_MODE, HOLD}
             ned = (await until(telemetry.subscribe_position_velocity_ned(), lambda x: True))[-1]
             assert ned.position.down_m == pytest.approx(-1.5, abs=0.1)
 
@@ -158,14 +173,15 @@ def test_offboard_needs_a_stream_and_then_accelerates_the_vehicle(simulator: Any
             await until(telemetry.subscribe_health_all_ok(), bool)
             await offboard.set_acceleration_ned(AccelerationNed(1.0, 0.0, 0.0))
             texts = asyncio.create_task(until(telemetry.subscribe_status_text(), lambda t: "no setpoint" in t.text))
+            await asyncio.sleep(0)  # the task subscribes before the autopilot has anything to say
             with pytest.raises(Exception, match="DENIED"):
                 await offboard.start()  # MAVSDK has streamed for some milliseconds only
             await texts
             moments = iter(range(8))  # of telemetry at 10 Hz: MAVSDK goes on streaming meanwhile
             await until(telemetry.subscribe_position_velocity_ned(), lambda _: next(moments) == 7)
             await offboard.start()
-            await until(telemetry.subscribe_flight_mode(), lambda m: m.name == OFFBOARD, 2.0)
-            ned = await until(telemetry.subscribe_position_velocity_ned(), lambda x: x.velocity.north_m_s > 0.8, 5.0)
+            await until(telemetry.subscribe_flight_mode(), lambda m: m.name == OFFBOARD)
+            ned = await until(telemetry.subscribe_position_velocity_ned(), lambda x: x.velocity.north_m_s > 0.8)
             assert abs(ned[-1].velocity.east_m_s) < 0.1
 
     asyncio.run(fly())
