@@ -135,14 +135,18 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     sigma_growth_s: NonNegative = 0.5  # predicted sigma counts up to this far ahead; the next looks correct the rest
     sigma_cap_m: Positive = 1.5  # kappa sigma counts no further than this: a track just born is no wall
     sigma_delay_s: NonNegative = 0.01
+    braking: bool = True  # brake before what is too large to swerve round within the horizon
     recovery: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02  # least decay of psi per dt_s inside the keep-out distance
     solver: Literal["daqp", "osqp"] = "daqp"
-    iterations: Annotated[int, Meta(ge=1, le=50)] = 6
+    iterations: Annotated[int, Meta(ge=1, le=50)] = 4
     tolerance_m_s2: Positive = 1e-6
 
 
 class LimitsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     acceleration_m_s2: Positive = 3.0  # each axis, net of gravity
+    norm_m_s2: Positive | None = None  # of the whole net acceleration
+    tilt_deg: Annotated[float, Meta(gt=0.0, lt=90.0)] | None = 45.0  # of the thrust (PX4: MPC_TILTMAX_AIR)
+    slew_m_s3: Positive | None = None  # each axis, how fast a setpoint may change
     speed_m_s: Positive = 6.0
     arena_min: Point = (-10.0, -10.0, 0.3)  # floor is the third component
     arena_max: Point = (10.0, 10.0, 10.0)
@@ -207,6 +211,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "safety": {
         "paper": {
             "form": "paper",
+            "braking": False,
             "horizon": 5,
             "kappa": 0.0,
             "sigma_delay_s": 0.0,

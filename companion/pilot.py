@@ -248,6 +248,7 @@ class Pilot:
                 limits_on=flying,
                 accel_shrink_m_s2=full - self._reserve_limit(),
                 elapsed_s=elapsed_s,
+                a_before=self._commands[-1][1] if self._commands else None,
             )
         )
 

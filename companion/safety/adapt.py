@@ -54,11 +54,12 @@ def decay_interval(values: FloatArray, least: FloatArray) -> tuple[FloatArray, F
         (lower, upper), each (...,); lower > upper where no decay serves.
     """
     rise, psi = values
-    opening = psi >= 0.0
-    bound = rise / (psi + np.copysign(_TINY, psi))  # less the decay at which the row is zero
-    if opening.all():
+    if np.minimum.reduce(psi, axis=None, initial=0.0) >= 0.0:
+        bound = rise / np.maximum(psi, _TINY)  # less the decay at which the row is zero
         lower = np.maximum(0.0 - np.minimum.reduce(bound, axis=-1), least)
         return lower, np.ones(lower.shape)
+    opening = psi >= 0.0
+    bound = rise / (psi + np.copysign(_TINY, psi))
     lower = np.maximum(0.0 - np.minimum.reduce(np.where(opening, bound, 0.0), axis=-1), least)
     upper = 0.0 - np.maximum.reduce(np.where(opening, -1.0, bound), axis=-1)
     return lower, np.minimum(upper, 1.0, out=upper)

@@ -28,6 +28,7 @@ from companion.config import SafetyConfig
 from companion.types import FloatArray, Margin, Prediction, Vec3
 
 MIN_ARM_M = 1e-3  # gradients are no shorter than that of a row with this arm: no division by zero at a ball's centre
+_ROUNDING = 1e-9  # of |c|^2, which is up to 1e13 for an obstacle far away
 _HALVES = np.full(3, 0.5)
 
 
@@ -38,6 +39,37 @@ def monomials(a: FloatArray) -> FloatArray:
     out[1:4] = a.T
     np.multiply(np.vecdot(a, a), 0.5, out=out[4])
     return out
+
+
+@dataclass(frozen=True, slots=True)
+class Balls:
+    """g = q (|a - c|^2 - rho^2) / 2 at one decay of each obstacle."""
+
+    decay: FloatArray  # (M,)
+    centre: FloatArray  # (3, M, R) c [m/s^2]
+    square: FloatArray  # (M, R) rho^2, negative where a row holds for every a [m^2/s^4]
+    q: FloatArray  # (M, R) > 0 [s^4]
+
+    def reachable(self, low: Vec3, high: Vec3) -> npt.NDArray[np.bool_]:
+        """Obstacles with a row that some acceleration of the box breaks, (M,).
+
+        With decay 1 all others admit every a of the box: leaving them out can change an answer only by the price of
+        their epsilon, never by a row.
+        """
+        gap = np.minimum(np.maximum(self.centre, low[:, None, None]), high[:, None, None])
+        gap -= self.centre
+        room = np.add.reduce(gap * gap)
+        room -= _ROUNDING * np.add.reduce(self.centre * self.centre)
+        return np.asarray(np.logical_or.reduce(room < self.square, axis=-1))
+
+    def select(self, taken: npt.NDArray[np.intp]) -> Balls:
+        """Of the obstacles of these indices only."""
+        return Balls(
+            self.decay.take(taken),
+            self.centre.take(taken, axis=1),
+            self.square.take(taken, axis=0),
+            self.q.take(taken, axis=0),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +123,17 @@ class BarrierRows:
         norm = np.sqrt(np.add.reduce(gradient * gradient))
         return gradient, np.maximum(norm, MIN_ARM_M * self.reach[2:], out=norm)
 
+    def balls(self, decay: FloatArray) -> Balls:
+        """Where rows do not admit an acceleration, each obstacle with its ``decay`` (M,)."""
+        combined = self.coefficients[:, 1] * decay[:, None]
+        combined += self.coefficients[:, 0]
+        q = combined[4]
+        combined[:4] /= q
+        centre = np.negative(combined[1:4], out=combined[1:4])
+        square = np.add.reduce(centre * centre)
+        square -= 2.0 * combined[0]
+        return Balls(decay, centre, square, q)
+
     def positions(self, a: FloatArray) -> FloatArray:
         """r_k, vehicle minus obstacle, from k = 2 (the first that ``a`` moves): (..., 3) -> (3, ..., M, R) [m]."""
         a = a.T if a.ndim > 1 else a  # (3, C) or (3,)
@@ -103,9 +146,8 @@ class BarrierRows:
         parts = zip(self.radii_m.tolist(), sigma, self.delay_m.tolist(), strict=True)
         return [Margin(radii, self.cushion_m, sigma, delay) for radii, sigma, delay in parts]
 
-    def select(self, obstacles: npt.NDArray[np.bool_]) -> BarrierRows:
-        """The rows of some obstacles only; ``obstacles`` is a boolean mask (M,)."""
-        taken = obstacles.nonzero()[0]
+    def select(self, taken: npt.NDArray[np.intp]) -> BarrierRows:
+        """The rows of the obstacles of these indices only."""
         return BarrierRows(
             ids=tuple([self.ids[index] for index in taken.tolist()]),
             coefficients=self.coefficients.take(taken, axis=2),

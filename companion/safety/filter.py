@@ -3,23 +3,25 @@
     minimise over a, epsilon_j, delta_j   the cost of `task`
     subject to   rows (24) for every obstacle j and step i = 0..N                     `barrier`
                  CLF (26) of each epsilon_j, relaxed by delta_j >= 0                  `adapt`
-                 acceleration box, arena with floor and ceiling, speed                `limits`
+                 acceleration box, slew, norm, tilt, arena, floor, ceiling, speed     `limits`, `cone`
+                 braking distance to what is too large to swerve round                `stopping`
 
 Identity first: if every limit admits the reference and every obstacle has some epsilon in [0, 1 / alpha2] under which
 its rows hold there, the reference passes to the bit and epsilon is the least such (delta relaxes only the CLF, so the
 CLF cannot refuse a reference). Else solve, then judge the *true* rows at the answer: `adjusted` only if they hold
 within the tolerance, otherwise `relaxed`, and the worst row is named.
 
-Why the vehicle does not fly into a state from which nothing helps: an admissible acceleration clears every obstacle
-at every step of the horizon T = (N + 2) dt when simply held. Within T a box of a_max moves the vehicle sideways by
-a_max T^2 / 2 (1.8 m for 1.1 s and 3 m/s^2), so an obstacle whose D is less than that is first seen by the rows while
-a swerve still clears it, at any closing speed; one that is larger asks for a longer horizon, N dt >= sqrt(2 D / a_max),
-or for a speed limit from which the vehicle stops within it. Walls do not move: there the braking distance itself is
-the bound (`limits`).
+Why the vehicle does not fly into a state from which nothing helps. An admissible acceleration clears every obstacle at
+every step of the horizon T = (N + 2) dt when simply held, and holding it stays within box, norm, tilt and slew: what is
+admissible now stays so for the same obstacles as they were predicted. What is new at the horizon's end needs room:
+within T the vehicle gets sideways by the swerve a_max T^2 / 2 (1.8 m for 1.1 s and 3 m/s^2; less with a slew limit).
+An obstacle whose D is smaller is first seen by the rows while a swerve still clears it, at any closing speed. Before
+one that is larger the braking distance itself is the bound (`stopping`), as it is for walls, which do not move.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,12 +30,14 @@ from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
 from companion.safety.adapt import clf_budget, decay_interval, epsilon_star
 from companion.safety.barrier import Barrier
-from companion.safety.limits import vehicle_limits
-from companion.safety.relax import braking
-from companion.safety.search import solve_task
-from companion.safety.task import Found, Task, turned, within_reach
+from companion.safety.limits import Capability, capability, vehicle_limits
+from companion.safety.relax import braking, least_violation
+from companion.safety.search import least_of_ways
+from companion.safety.stopping import StopRows, stop_rows, swerve_m
+from companion.safety.task import Found, Task, turned
 from companion.types import FilterResult, FloatArray, Prediction, RowRecord, Vec3, Verdict, frozen
 
+_DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
 LIMIT_LISTED_M_S2 = 0.05  # a vehicle limit with less room than this is listed with the answer
 _OTHER = {"daqp": ("daqp", "osqp"), "osqp": ("osqp", "daqp")}
 
@@ -50,6 +54,7 @@ class FilterInput:
     limits_on: bool = True  # arena, floor and ceiling; off in READY
     accel_shrink_m_s2: float = 0.0  # the box is smaller by what the disturbance estimate may add
     elapsed_s: float | None = None  # vehicle time since the last call, None on the first
+    a_before: Vec3 | None = None  # the last setpoint sent, for slew; None: hover [m/s^2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +74,7 @@ class SafetyFilter:
         self._limits = limits
         self._barrier = Barrier(safety)
         self._order = _OTHER[safety.solver]
+        self._kept: tuple[float, Capability] | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -92,24 +98,40 @@ class SafetyFilter:
         """
         config, prediction = self._safety, inputs.prediction
         rows = self._barrier.rows(inputs.p_enu, inputs.v_enu, prediction, inputs.p_std_m)
+        can = self._capability(inputs.accel_shrink_m_s2)
         limits = vehicle_limits(
             inputs.p_enu,
             inputs.v_enu,
             self._limits,
+            can,
             arena_on=inputs.limits_on,
-            shrink_m_s2=inputs.accel_shrink_m_s2,
-            dt_s=config.dt_s,
+            before=inputs.a_before,
+            elapsed_s=inputs.elapsed_s,
         )
-        star = epsilon_star(-rows.drift[:, :, 0].T, prediction.v_enu - inputs.v_enu, config)
-        return Task(rows, limits, inputs.a_ref, star, star, config)
+        r, v_rel = -rows.drift[:, :, 0].T, prediction.v_enu - inputs.v_enu
+        star = epsilon_star(r, v_rel, config)
+        stops = None
+        if config.braking and len(prediction):
+            swerve = swerve_m(can.authority_m_s2, math.sqrt(2.0 * rows.reach[-1]), can.braking.slew_m_s3)
+            stops = stop_rows(-r, -v_rel, rows.keep_out_m[:, 0], can.braking, swerve)
+        return Task(rows, limits, inputs.a_ref, star, star, config, stops)
+
+    def _capability(self, shrink_m_s2: float) -> Capability:
+        """Kept from tick to tick: it changes with the shrinking only."""
+        if self._kept is None or self._kept[0] != shrink_m_s2:
+            can = capability(self._limits, shrink_m_s2=shrink_m_s2, dt_s=self._safety.dt_s)
+            self._kept = shrink_m_s2, can
+        return self._kept[1]
 
     def solve(self, task: Task, elapsed_s: float) -> Answer:
         """The reference where it is admissible, else the search's answer, as yet unjudged."""
         values = task.rows.evaluate(task.a_ref)
         lower, upper = decay_interval(values, task.rows.least_decay)
-        if bool((lower <= upper).all()) and task.limits.admits(task.a_ref):
+        stopping = task.stops is None or bool((task.stops.slack(task.a_ref) >= 0.0).all())
+        if stopping and bool((lower <= upper).all()) and task.limits.admits(task.a_ref):
             return Answer(Found(task.a_ref, lower / self._safety.alpha2, True, 0.0, 0, "none"), values, Verdict.NOMINAL)
-        return self._search(replace(task, budget=self._budget(task, elapsed_s)))
+        budget = self._budget(task, elapsed_s)
+        return self._search(Task(task.rows, task.limits, task.a_ref, task.star, budget, task.config, task.stops))
 
     def _budget(self, task: Task, elapsed_s: float) -> FloatArray:
         """What the CLF leaves each obstacle; one without history starts from the greatest epsilon."""
@@ -120,21 +142,33 @@ class SafetyFilter:
 
     def _search(self, task: Task) -> Answer:
         """The answer with epsilons of all obstacles."""
-        near = within_reach(task.rows, task.limits)
-        rows = task.rows if near.all() else task.rows.select(near)
-        a_ref = turned(rows, task.a_ref)
-        reduced = Task(rows, task.limits, a_ref, task.star[near], task.budget[near], task.config)
+        balls = task.rows.balls(np.ones(len(task.rows)))
+        near = balls.reachable(task.limits.hard_low, task.limits.hard_high)
+        if task.stops is not None:
+            near |= task.stops.floor > -_DIAGONAL * task.limits.box_m_s2
+        taken = near.nonzero()[0]
+        reduced = task
+        if len(taken) < len(near):
+            reduced, balls = task.select(taken), balls.select(taken)
+        a_ref = turned(reduced.rows, task.a_ref)
+        if a_ref is not task.a_ref:
+            reduced = replace(reduced, a_ref=a_ref)
+        last = a_ref if self._last is None else self._last
+        verdict = Verdict.ADJUSTED
         try:
-            found, verdict = solve_task(reduced, self._last, self._order), Verdict.ADJUSTED
+            found = least_of_ways(reduced, balls, last, self._order)
+            if not found.admissible:
+                found = least_violation(reduced, last, self._order)
         except SolverError:
-            found, verdict = braking(reduced, self._last), Verdict.BRAKING
+            found, verdict = braking(reduced, last), Verdict.BRAKING
         values = task.rows.evaluate(found.a)
-        if rows is task.rows:
+        if reduced.rows is task.rows:
             return Answer(found, values, verdict)
         lower, upper = decay_interval(values, task.rows.least_decay)
         epsilon = np.minimum(np.maximum(task.star, lower / self._safety.alpha2), upper / self._safety.alpha2)
-        epsilon[near] = found.epsilon
-        return Answer(replace(found, epsilon=epsilon), values, verdict)
+        epsilon[taken] = found.epsilon
+        found = Found(found.a, epsilon, found.admissible, found.cost, found.iterations, found.solver)
+        return Answer(found, values, verdict)
 
     def verify(self, task: Task, answer: Answer) -> FilterResult:
         """The verdict and the record: the true rows at the answer decide between adjusted and relaxed."""
@@ -147,13 +181,24 @@ class SafetyFilter:
             for name, slack in slacks.items()
             if slack < LIMIT_LISTED_M_S2
         ]
-        records = (*obstacles, *limits)
+        stops = [] if task.stops is None else _stop_records(task, found, task.stops)
+        records = (*obstacles, *stops, *limits)
         worst = min(records, key=lambda record: record.slack, default=None)
         if verdict is Verdict.ADJUSTED and worst is not None and worst.slack < -self._safety.tolerance_m_s2:
             verdict = Verdict.RELAXED
         self._last = a = frozen(a)
         self._epsilon = dict(zip(rows.ids, found.epsilon.tolist(), strict=True))
         return FilterResult(a, verdict, worst, records, found.iterations, found.solver)
+
+
+def _stop_records(task: Task, found: Found, stops: StopRows) -> list[RowRecord]:
+    """Braking rows with little room left; like the vehicle's limits they have no horizon step."""
+    margins = task.rows.margins(np.zeros(len(task.rows), dtype=np.intp))
+    return [
+        RowRecord(task.rows.ids[j], -1, slack, margins[j], float(found.epsilon[j]), float(task.star[j]))
+        for j, slack in enumerate(stops.slack(found.a).tolist())
+        if slack < LIMIT_LISTED_M_S2
+    ]
 
 
 def _worst_rows(task: Task, found: Found, values: FloatArray) -> list[RowRecord]:

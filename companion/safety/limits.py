@@ -1,11 +1,10 @@
-"""Limits of the vehicle as bounds on the same acceleration: box, arena with floor and ceiling, speed.
+"""Limits of the vehicle as constraints on the same acceleration.
 
-Arena, each side: with d the distance left after the coming step (which a no longer changes) and a_b the braking
-acceleration, the largest speed that still stops on the grid is w(d), v^2 / (2 a_b) + v dt / 2 = d. The bound is
-v + a dt <= w(d): a bound on one component of a, one braking distance ahead of the wall. a_b is a share of the box,
-so that lag and disturbance find something left. Outside the arena w is the speed at which to come back.
-
-Speed: |v + a dt| <= v_max; above it, slow down by half of what the box allows.
+What the vehicle cannot exceed is kept by every answer: the acceleration box, slew (a box about the last setpoint, one
+tick wide), norm and tilt (`cone`). Arena with floor and ceiling: one braking distance ahead of each wall (`stopping`),
+a bound on one component of a; braking counts on a share of the box only, so that lag and disturbance find something
+left. Speed: |v + a t| <= v_max with t = dt, and with a slew limit the time to slew from the box to nothing on top;
+above it, slow down by half of what the box allows.
 """
 
 from __future__ import annotations
@@ -16,12 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.config import LimitsConfig
+from companion.safety.cone import G_M_S2, Cone, norm_cone, speed_cone, tilt_cone
+from companion.safety.stopping import Braking
 from companion.types import FloatArray, Vec3
 
 BRAKING_SHARE = 0.7  # of the acceleration box, counted on for stopping at a wall
-RETURN_RATE_HZ = 1.0  # speed towards the arena per metre outside it
-_DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
 ROUNDING_M_S2 = 1e-9  # a reference clipped to the same box by someone else may differ in the last bits
+_DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,96 +29,133 @@ class VehicleLimits:
     """What the vehicle's limits leave of one tick's acceleration, ENU [m/s^2]."""
 
     box_m_s2: float  # each axis
-    low: Vec3  # box and arena together, never empty
+    hard_low: Vec3  # box and slew, what no answer leaves
+    hard_high: Vec3
+    low: Vec3  # the same and the arena, never empty
     high: Vec3
-    arena_low: Vec3  # what the arena asks, possibly beyond the box
+    arena_low: Vec3  # what the arena asks, possibly beyond box and slew
     arena_high: Vec3
     v_enu: Vec3  # [m/s]
-    speed_bound_m_s: float
-    dt_s: float
-    may_speed: bool = True  # whether an acceleration of the box can break the speed limit at all
+    speed: Cone
+    may_speed: bool  # whether an acceleration of the box can break the speed limit at all
+    cones: tuple[Cone, ...]  # norm and tilt, where an acceleration of the box can break them
+    inside: Vec3  # a point of all hard limits
 
     def slacks(self, a: Vec3) -> dict[str, float]:
         """Room left of each limit at ``a``, negative where broken [m/s^2]."""
         below, above = (a - self.arena_low).tolist(), (self.arena_high - a).tolist()
-        return {
+        room = {
             "arena": min(below[0], below[1], above[0], above[1]),
             "floor": below[2],
             "ceiling": above[2],
-            "speed": (self.speed_bound_m_s - self._speed_after(a)) / self.dt_s,
+            "speed": -float(self.speed.excess(a)),
         }
-
-    def _speed_after(self, a: Vec3) -> float:
-        return math.hypot(*(self.v_enu + a * self.dt_s).tolist())
+        return room | {cone.name: -float(cone.excess(a)) for cone in self.cones}
 
     def admits(self, a: Vec3) -> bool:
         """Whether ``a`` keeps every limit."""
-        box = self.box_m_s2
-        for x, low, high in zip(a.tolist(), self.arena_low.tolist(), self.arena_high.tolist(), strict=True):
-            if not max(low, -box) - ROUNDING_M_S2 <= x <= min(high, box) + ROUNDING_M_S2:
-                return False
-        return self._speed_after(a) <= self.speed_bound_m_s
+        outside = np.maximum(self.hard_low, self.arena_low) - a, a - np.minimum(self.hard_high, self.arena_high)
+        if max(*outside[0].tolist(), *outside[1].tolist()) > ROUNDING_M_S2:
+            return False
+        if self.may_speed and self.speed.excess(a) > 0.0:
+            return False
+        return all(cone.excess(a) <= ROUNDING_M_S2 for cone in self.cones)
 
-    def slow(self, a: FloatArray) -> FloatArray:
-        """How far each of ``a`` (C, 3), within the box, breaks the speed limit, 0 where it holds [m/s^2]."""
-        if not self.may_speed:
-            return np.zeros(len(a))
-        v = self.v_enu + a * self.dt_s
-        speed = np.sqrt(np.vecdot(v, v))
-        return np.asarray(np.maximum(speed - self.speed_bound_m_s, 0.0) / self.dt_s)
-
-    def speed_row(self, a: Vec3) -> tuple[FloatArray, float]:
-        """The tangent of the speed limit at ``a`` as ``normal @ a >= floor``."""
-        v = self.v_enu + a * self.dt_s
-        speed = math.hypot(*v.tolist())
-        if speed < 1e-9:
-            return np.zeros(3), -self.speed_bound_m_s / self.dt_s
-        normal = -v / speed
-        return normal, -(self.speed_bound_m_s + float(normal @ self.v_enu)) / self.dt_s
+    def fast(self, a: FloatArray) -> FloatArray:
+        """How far each of ``a`` (C, 3) breaks the speed limit, 0 where it holds [m/s^2]."""
+        return np.maximum(self.speed.excess(a), 0.0) if self.may_speed else np.zeros(len(a))
 
     def clip(self, a: FloatArray) -> FloatArray:
-        """``a`` (..., 3) into box and arena."""
-        inside = np.maximum(a, self.low)
-        return np.minimum(inside, self.high, out=inside)
+        """``a`` (C, 3) into box, slew, arena and cones."""
+        return self._into(a, self.low, self.high)
+
+    def clip_hard(self, a: FloatArray) -> FloatArray:
+        """``a`` (C, 3) into box, slew and cones: what the vehicle can do at all."""
+        return self._into(a, self.hard_low, self.hard_high)
+
+    def _into(self, a: FloatArray, low: Vec3, high: Vec3) -> FloatArray:
+        clipped = np.maximum(a, low)
+        np.minimum(clipped, high, out=clipped)
+        for cone in self.cones:  # towards a point inside: what is nearer to it stays within the limits before
+            clipped = self.inside + cone.share(self.inside, clipped)[:, None] * (clipped - self.inside)
+        return clipped
 
 
-def braking_speed(distance_m: float, braking_m_s2: float, dt_s: float) -> float:
-    """Largest speed that stops within ``distance_m``: v^2 / (2 a) + v dt / 2 = d; towards the inside where d < 0.
+@dataclass(frozen=True, slots=True)
+class Capability:
+    """What the configuration lets a vehicle do, less what the disturbance estimate may add."""
 
-    The way back is no faster than what stops within |d|: the bounds of two opposite walls never cross.
-    """
-    half = 0.5 * braking_m_s2 * dt_s
-    stops = math.sqrt(half * half + 2.0 * braking_m_s2 * abs(distance_m)) - half
-    return stops if distance_m >= 0.0 else -min(-RETURN_RATE_HZ * distance_m, stops)
+    box_m_s2: float
+    braking: Braking
+    authority_m_s2: float  # in every direction from hover
+    cones: tuple[Cone, ...]
+
+
+def capability(config: LimitsConfig, *, shrink_m_s2: float, dt_s: float) -> Capability:
+    """The same for every tick of one configuration."""
+    box = max(config.acceleration_m_s2 - shrink_m_s2, 0.0)
+    cones, authority = [], box
+    if config.norm_m_s2 is not None:
+        cones.append(norm_cone(config.norm_m_s2))
+        authority = min(authority, config.norm_m_s2)
+    if config.tilt_deg is not None:
+        cones.append(tilt_cone(config.tilt_deg))
+        authority = min(authority, G_M_S2 * math.sin(math.radians(config.tilt_deg)))
+    corners = box * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+    binding = tuple(cone for cone in cones if cone.excess(corners).max() > 0.0)
+    return Capability(box, Braking(BRAKING_SHARE * authority, dt_s, config.slew_m_s3), authority, binding)
 
 
 def vehicle_limits(
-    p_enu: Vec3, v_enu: Vec3, config: LimitsConfig, *, arena_on: bool, shrink_m_s2: float, dt_s: float
+    p_enu: Vec3,
+    v_enu: Vec3,
+    config: LimitsConfig,
+    can: Capability,
+    *,
+    arena_on: bool = True,
+    before: Vec3 | None = None,
+    elapsed_s: float | None = None,
 ) -> VehicleLimits:
-    """The limits at one vehicle state; the box is shrunk by what the disturbance estimate may add."""
-    box = max(config.acceleration_m_s2 - shrink_m_s2, 0.0)
+    """The limits at one vehicle state.
+
+    Args:
+        before: the last setpoint sent [m/s^2], for slew; None: hover.
+        elapsed_s: vehicle time since then; None: dt.
+    """
+    box, braking = can.box_m_s2, can.braking
+    hard_low, hard_high = [-box] * 3, [box] * 3
+    inside = [0.0] * 3
+    if braking.slew_m_s3 is not None:
+        step = braking.slew_m_s3 * (braking.dt_s if elapsed_s is None else elapsed_s)
+        inside = [min(max(x, -box), box) for x in (inside if before is None else before.tolist())]
+        hard_low = [max(x - step, -box) for x in inside]
+        hard_high = [min(x + step, box) for x in inside]
     arena_low, arena_high = [-math.inf] * 3, [math.inf] * 3
-    low, high = [-box] * 3, [box] * 3
-    velocity = v_enu.tolist()
+    low, high = hard_low.copy(), hard_high.copy()
     if arena_on:
-        for axis, (p, v) in enumerate(zip(p_enu.tolist(), velocity, strict=True)):
-            ahead = p + v * dt_s
-            up = braking_speed(config.arena_max[axis] - ahead, BRAKING_SHARE * box, dt_s)
-            down = braking_speed(ahead - config.arena_min[axis], BRAKING_SHARE * box, dt_s)
-            arena_low[axis], arena_high[axis] = (-down - v) / dt_s, (up - v) / dt_s
-            low[axis] = min(max(arena_low[axis], -box), box)
-            high[axis] = min(max(arena_high[axis], -box), box)
-    bounds = np.array((low, high, arena_low, arena_high))
-    speed = math.hypot(*velocity)
-    bound = max(config.speed_m_s, speed - 0.5 * box * dt_s)
+        for axis, (p, v) in enumerate(zip(p_enu.tolist(), v_enu.tolist(), strict=True)):
+            arena_high[axis] = braking.bound(config.arena_max[axis] - p, v)
+            arena_low[axis] = -braking.bound(p - config.arena_min[axis], -v)
+            low[axis] = min(max(arena_low[axis], low[axis]), hard_high[axis])
+            high[axis] = max(min(arena_high[axis], high[axis]), low[axis])
+    bounds = np.array((hard_low, hard_high, low, high, arena_low, arena_high, inside))
+    centre = bounds[6]
+    for cone in can.cones:  # rounding, or a setpoint from before the limits were tightened
+        centre = centre * cone.share(np.zeros(3), centre[None])
+    speed = math.hypot(*v_enu.tolist())
+    ahead_s = braking.dt_s + (box / braking.slew_m_s3 if braking.slew_m_s3 else 0.0)
+    bound = max(config.speed_m_s, speed - 0.5 * box * braking.dt_s)
     return VehicleLimits(
         box_m_s2=box,
-        low=bounds[0],
-        high=bounds[1],
-        arena_low=bounds[2],
-        arena_high=bounds[3],
+        hard_low=bounds[0],
+        hard_high=bounds[1],
+        low=bounds[2],
+        high=bounds[3],
+        arena_low=bounds[4],
+        arena_high=bounds[5],
         v_enu=v_enu,
-        speed_bound_m_s=bound,
-        dt_s=dt_s,
-        may_speed=speed + _DIAGONAL * box * dt_s > bound,
+        speed=speed_cone(v_enu, bound, ahead_s),
+        may_speed=speed + _DIAGONAL * box * ahead_s > bound,
+        cones=can.cones,
+        inside=centre,
     )

@@ -1,10 +1,14 @@
-"""Where no acceleration keeps every row: the least violation, and without any solver: braking.
+"""Where no acceleration keeps every row: the least violation, lexicographic, and without any solver: braking.
 
-The violation is measured by the share t <= 1 of the margin beyond the bare radii that every obstacle can be left
-over the horizon, |r_k(a)| >= R + t (D - R): 1 is all of D, 0 is contact. Row values in m/s^2 would rank the first steps
-of the horizon, which no acceleration moves much, above the closest approach. |r_k| is convex in a, so its tangents
-bound it from below and t never falls from one program to the next. Walls are kept while t >= 0, that is while nobody
-is touched, and given up after that; the speed limit goes before both.
+What counts first is that nobody is touched, obstacle by obstacle in the order of the time to contact; then their
+margins in the same order; then the arena; then speed; then the reference. Box, slew, norm and tilt are kept by all of
+it: the vehicle cannot leave them.
+
+The violation is measured by the share t <= 1 of the margin beyond the bare radii that an obstacle is left over the
+horizon, |r_k(a)| >= R + t (D - R): 1 is all of D, 0 is contact. Row values in m/s^2 would rank the first steps of the
+horizon, which no acceleration moves much, above the closest approach. |r_k| is convex in a, so its tangents bound it
+from below and a share never falls from one program to the next. Each program raises the share of one obstacle and
+keeps those of the obstacles before it.
 """
 
 from __future__ import annotations
@@ -12,27 +16,34 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
+from companion.errors import SolverError
 from companion.safety.adapt import decay_interval
 from companion.safety.barrier import BarrierRows
 from companion.safety.qp import UNBOUNDED, Program, solve
+from companion.safety.search import limit_rows
 from companion.safety.task import Found, Task, candidates, judge
 from companion.types import FloatArray, Vec3
 
-SHARE_WEIGHT = 1e4  # cost of the whole margin, against |a - a_ref|^2 in (m/s^2)^2
-LEAVE_WEIGHT = 1e2  # the same at the end of the horizon: a vehicle inside the margin leaves it
-SPEED_WEIGHT = 10.0  # cost of breaking the speed limit by 1 m/s^2
+SHARE_WEIGHT = 1e6  # cost of the whole margin, against |a - a_ref|^2 in (m/s^2)^2
+LEAVE_WEIGHT = 1e4  # the same at the end of the horizon: a vehicle inside the margin leaves it
+STOP_WEIGHT, ARENA_WEIGHT, SPEED_WEIGHT = 3e3, 1e3, 1e2  # cost of breaking each by 1 m/s^2
 KEEP_WAY = 0.15  # share of the margin that another way round must offer before the last answer's is left
 SETTLED_M_S2 = 1e-3  # iterates closer than this have converged
+KEPT = 1e-6  # share that an obstacle may lose to those after it: the solver's tolerance
+UNKEPT = 1e3  # a share below which no obstacle can be
+_VARIABLES, _STOP, _ARENA, _SPEED = 8, 5, 6, 7
+_STEP = 0.05  # of a share: candidates closer than this are equally good for an obstacle
 
 
 def shares(rows: BarrierRows, a: FloatArray) -> FloatArray:
-    """Least share of the margin left by any obstacle over the horizon at ``a`` (C, 3): 1 all, 0 contact, (C,)."""
+    """Least share of the margin left by each obstacle over the horizon at ``a`` (C, 3): 1 all, 0 contact, (C, M)."""
     r = rows.positions(a)
     share = np.sqrt(np.add.reduce(r * r))  # (C, M, R)
     share -= rows.radii_m[:, None]
     share /= _margins(rows)
-    return np.asarray(np.minimum.reduce(share.reshape(len(a), share[0].size), axis=-1, initial=1.0))
+    return np.asarray(np.minimum(np.minimum.reduce(share, axis=-1), 1.0))
 
 
 def _margins(rows: BarrierRows) -> FloatArray:
@@ -40,71 +51,125 @@ def _margins(rows: BarrierRows) -> FloatArray:
     return np.maximum(rows.keep_out_m - rows.radii_m[:, None], 1e-3)
 
 
-def least_violation(task: Task, starts: FloatArray, order: tuple[str, ...]) -> Found:
-    """The acceleration that keeps the largest share of the margin; the walls go when contact is predicted.
+def by_contact(rows: BarrierRows) -> npt.NDArray[np.intp]:
+    """Obstacles by the time to contact, (M,): without acceleration, the first step within D, else the closest."""
+    drift = rows.drift[:, :, 2:]
+    gap = np.sqrt(np.add.reduce(drift * drift)) - rows.keep_out_m
+    inside = gap < 0.0
+    steps = gap.shape[1]
+    first = np.where(inside.any(axis=1), inside.argmax(axis=1), steps + gap.argmin(axis=1))
+    return np.lexsort((gap.min(axis=1), first))
+
+
+def widest(offered: FloatArray) -> int:
+    """The candidate that is lexicographically best: contact first, then margin, in the obstacles' order.
+
+    Args:
+        offered: shares of candidates, obstacles by the time to contact, (C, M).
+    """
+    contact = np.minimum(offered, 0.0)
+    keys = np.round(np.concatenate((contact, offered), axis=1) / _STEP)
+    return int(np.lexsort(np.concatenate((-offered.sum(axis=1)[:, None], -keys[:, ::-1]), axis=1).T)[0])
+
+
+def least_violation(task: Task, last: Vec3, order: tuple[str, ...]) -> Found:
+    """The lexicographically least violation, within ``config.iterations`` programs.
+
+    The first obstacles each have a program of their own, what comes after them one together, which is repeated.
 
     Raises:
         SolverError: no solver has an answer.
     """
-    walled = _widest(task, starts, task.limits.low, task.limits.high, order)
-    if float(shares(task.rows, walled.a[None])[0]) >= 0.0:
-        return walled
-    box = np.full(3, task.limits.box_m_s2)
-    return _widest(task, starts, -box, box, order)
-
-
-def _widest(task: Task, starts: FloatArray, low: Vec3, high: Vec3, order: tuple[str, ...]) -> Found:
-    offered = shares(task.rows, starts) - task.limits.slow(starts)
-    offered[0] += KEEP_WAY
-    a = starts[int(offered.argmax())]
-    for count in range(1, task.config.iterations + 1):  # noqa: B007
-        x, solver = solve(_share_program(task, a, low, high), order)
-        previous, a = a, np.clip(x[:3], low, high)
-        if float(np.abs(a - previous).max()) < SETTLED_M_S2:
+    rows, limits, budget = task.rows, task.limits, task.config.iterations
+    starts = limits.clip_hard(np.concatenate((last[None], candidates(task))))
+    ranks, offered = by_contact(rows), shares(rows, starts)
+    offered[0] += np.where(offered[0] < 1.0, KEEP_WAY, 0.0)
+    a = starts[widest(offered[:, ranks])]
+    kept = np.full((len(rows), 2), -np.inf)  # shares over the horizon and at its end that may not be lost
+    kept[:, 0] = np.minimum(shares(rows, a[None])[0], 0.0) - KEPT  # no obstacle is touched for another's margin
+    alone = min(len(ranks) - 1, budget // 2)
+    groups = [ranks[j : j + 1] for j in range(alone)] + [ranks[max(alone, 0) :]]
+    x, solver = solve(_share_program(task, a, kept, groups[0]), order)
+    for count in range(1, budget + 1):
+        previous, a = a, limits.clip_hard(x[None, :3])[0]
+        settled = float(np.abs(a - previous).max()) < SETTLED_M_S2
+        if count == budget or (settled and len(groups) == 1):
             break
-    lower, upper = decay_interval(task.rows.evaluate(a), task.rows.least_decay)
+        if len(groups) > 1:
+            kept[groups.pop(0)] = x[3:5] - KEPT
+        try:
+            x, solver = solve(_share_program(task, a, kept, groups[0]), order)
+        except SolverError:  # what was kept is no longer to be had to the last digit: the iterate is an answer
+            break
+    lower, upper = decay_interval(rows.evaluate(a), rows.least_decay)
     epsilon = np.clip(0.5 * (lower + upper), 0.0, 1.0) / task.config.alpha2
     return Found(a, epsilon, False, np.inf, count, solver)
 
 
-def _share_program(task: Task, a: Vec3, low: Vec3, high: Vec3) -> Program:
-    """Variables a, t, t at the horizon's end, the speed limit's slack: |r_k|'s tangent at ``a`` >= R + t (D - R)."""
-    rows = task.rows
+def _share_program(task: Task, a: Vec3, kept: FloatArray, raised: npt.NDArray[np.intp]) -> Program:
+    """|r_k|'s tangent at ``a`` >= R + t (D - R), t common to the ``raised`` obstacles and no less than what is kept.
+
+    Variables a, t, t at the horizon's end, and how far stops, arena and speed are broken.
+    """
+    rows, limits = task.rows, task.limits
     r = rows.positions(a)
     distance = np.maximum(np.sqrt(np.add.reduce(r * r)), 1e-9)
     normal = r * (rows.reach[2:] / distance)
     floor = (a @ normal.reshape(3, -1)).reshape(distance.shape) - distance + rows.radii_m[:, None]
-    margins, every = _margins(rows), floor.size
-    tangents = np.zeros((every + len(rows) + 1, 6))
-    floors = np.empty(len(tangents))
-    tangents[:every, :3], tangents[every:-1, :3] = normal.reshape(3, -1).T, normal[:, :, -1].T
-    tangents[:every, 3], tangents[every:-1, 4] = -margins.reshape(-1), -margins[:, -1]
-    floors[:every], floors[every:-1] = floor.reshape(-1), floor[:, -1]
-    tangents[-1, :3], floors[-1] = task.limits.speed_row(a)
-    tangents[-1, 5] = 1.0
+    margins = _margins(rows)
+    end = slice(-1, None)
+    # of every obstacle what is kept, over the horizon and at its end; of those raised t, and t at the end
+    parts = (
+        (normal, floor + np.maximum(kept[:, :1], -UNKEPT) * margins, np.zeros(floor.size), 3),
+        (normal[..., end], floor[:, end] + np.maximum(kept[:, 1:], -UNKEPT) * margins[:, end], np.zeros(len(rows)), 4),
+        (normal[:, raised], floor[raised], -margins[raised].reshape(-1), 3),
+        (normal[:, raised, end], floor[raised, end], -margins[raised, -1], 4),
+    )
+    tangents, floors = _limit_part(task, a)
+    for slope, least, share, column in parts:
+        part = np.zeros((least.size, _VARIABLES))
+        part[:, :3], part[:, column] = slope.reshape(3, -1).T, share
+        tangents.append(part)
+        floors.append(least.reshape(-1))
     return Program(
-        weight=np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0 * SPEED_WEIGHT]),
-        linear=np.array([*(-2.0 * task.a_ref), -SHARE_WEIGHT, -LEAVE_WEIGHT, 0.0]),
-        low=np.array([*low, -UNBOUNDED, -UNBOUNDED, 0.0]),
-        high=np.array([*high, 1.0, 1.0, UNBOUNDED]),
-        rows=tangents,
-        floor=floors,
+        weight=np.full(_VARIABLES, 2.0),
+        linear=np.array([*(-2.0 * task.a_ref), -SHARE_WEIGHT, -LEAVE_WEIGHT, STOP_WEIGHT, ARENA_WEIGHT, SPEED_WEIGHT]),
+        low=np.array([*limits.hard_low, -UNBOUNDED, -UNBOUNDED, 0.0, 0.0, 0.0]),
+        high=np.array([*limits.hard_high, 1.0, 1.0, UNBOUNDED, UNBOUNDED, UNBOUNDED]),
+        rows=np.concatenate(tangents),
+        floor=np.concatenate(floors),
     )
 
 
-def braking(task: Task, last: Vec3 | None) -> Found:
-    """Without any solver, of the candidates and a straight stop: admissible first, then widest, then slowest.
+def _limit_part(task: Task, a: Vec3) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Rows of cones (kept), stops, arena and speed (each with what it is broken by)."""
+    limits = task.limits
+    tangents, floors = limit_rows(task, a, _VARIABLES)
+    first = len(limits.cones)
+    if limits.may_speed:
+        tangents[first, _SPEED] = 1.0
+        first += 1
+    tangents[first:, _STOP] = 1.0
+    arena = np.zeros((6, _VARIABLES))
+    arena[:3, :3], arena[3:, :3], arena[:, _ARENA] = np.eye(3), -np.eye(3), 1.0
+    walls = np.concatenate((limits.arena_low, -limits.arena_high))
+    return [tangents, arena], [floors, np.maximum(walls, -UNBOUNDED)]
+
+
+def braking(task: Task, last: Vec3) -> Found:
+    """Without any solver, of the ways to go and a straight stop: admissible first, then widest, then slowest.
 
     The vehicle is to lose speed along the safest direction, so among equally safe candidates |v + a dt| decides.
     """
-    limits = task.limits
+    limits, dt_s = task.limits, task.config.dt_s
     speed = math.dist((0.0, 0.0, 0.0), limits.v_enu)
-    stop = -limits.v_enu * min(limits.box_m_s2 / max(speed, 1e-9), 1.0 / limits.dt_s)
-    starts = np.concatenate((limits.clip(stop)[None], candidates(task, last)))
+    stop = -limits.v_enu * min(limits.box_m_s2 / max(speed, 1e-9), 1.0 / dt_s)
+    starts = limits.clip(np.concatenate((stop[None], last[None], candidates(task))))
     judgement = judge(task, starts)
-    share = np.where(judgement.admissible, 1.0, np.minimum(shares(task.rows, starts), 1.0 - 1e-9))
-    v_next = limits.v_enu + starts * limits.dt_s
-    order = np.lexsort(((v_next * v_next).sum(axis=-1), -np.round(share, 3)))
+    least = np.minimum.reduce(shares(task.rows, starts), axis=-1, initial=1.0)
+    share = np.where(judgement.admissible, 1.0, np.minimum(least, 1.0 - 1e-9))
+    v_next = limits.v_enu + starts * dt_s
+    order = np.lexsort((np.vecdot(v_next, v_next), -np.round(share, 3)))
     best = int(order[0])
     epsilon = np.clip(np.maximum(task.star, judgement.lower[best]), 0.0, 1.0 / task.config.alpha2)
     return Found(starts[best], epsilon, bool(judgement.admissible[best]), np.inf, 0, "none")

@@ -22,6 +22,7 @@ from companion.config import SafetyConfig
 from companion.safety.adapt import decay_interval
 from companion.safety.barrier import BarrierRows
 from companion.safety.limits import VehicleLimits
+from companion.safety.stopping import StopRows
 from companion.types import FloatArray, Vec3
 
 _ANGLES = np.arange(8) * (2.0 * np.pi / 8)
@@ -42,6 +43,12 @@ class Task:
     star: FloatArray  # (M,) epsilon*
     budget: FloatArray  # (M,) what the CLF leaves (epsilon - epsilon*)^2 without delta
     config: SafetyConfig
+    stops: StopRows | None = None  # of obstacles too large to swerve round
+
+    def select(self, taken: npt.NDArray[np.intp]) -> Task:
+        """The problem of some obstacles only."""
+        rows, stops = self.rows.select(taken), None if self.stops is None else self.stops.select(taken)
+        return Task(rows, self.limits, self.a_ref, self.star[taken], self.budget[taken], self.config, stops)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,31 +72,27 @@ class Judgement:
     admissible: npt.NDArray[np.bool_]  # (C,)
     cost: FloatArray  # (C,) with the cheapest epsilon
 
+    def greatest(self, index: int, alpha2: float) -> FloatArray:
+        """The epsilon that asks least of a, (M,)."""
+        return np.asarray(np.maximum(np.minimum(self.upper[index], 1.0 / alpha2), 0.0))
+
     @property
     def ranked(self) -> FloatArray:
         """Cost where admissible, infinite elsewhere, (C,)."""
         return np.where(self.admissible, self.cost, np.inf)
 
 
-def within_reach(rows: BarrierRows, limits: VehicleLimits) -> npt.NDArray[np.bool_]:
-    """Obstacles that can bind: not those whose rows hold at decay 1 for every acceleration of the box, (M,).
-
-    At decay 1 a row is psi_{i+1} >= 0; over |a| <= sqrt(3) box it is at least its constant less |linear| |a|.
-    """
-    at_one = rows.rise[:4] + rows.psi[:4]
-    linear = np.sqrt(np.add.reduce(at_one[1:] * at_one[1:]))
-    return np.asarray(np.logical_or.reduce(at_one[0] < (math.sqrt(3.0) * limits.box_m_s2) * linear, axis=-1))
-
-
 def judge(task: Task, a: FloatArray) -> Judgement:
-    """True rows and limits at ``a`` (C, 3), within the box, all in one batch."""
+    """True rows and limits at ``a`` (C, 3), within box, slew, arena and cones, all in one batch."""
     config = task.config
     lower, upper = decay_interval(task.rows.evaluate_many(a), task.rows.least_decay)
     lower /= config.alpha2
     upper /= config.alpha2
     admissible = np.logical_and.reduce(lower <= upper, axis=-1)
     if task.limits.may_speed:
-        admissible &= task.limits.slow(a) <= config.tolerance_m_s2
+        admissible &= task.limits.fast(a) <= config.tolerance_m_s2
+    if task.stops is not None:
+        admissible &= np.minimum.reduce(task.stops.slack(a), axis=-1) >= -config.tolerance_m_s2
     deviation = np.minimum(np.maximum(task.star, lower), upper)
     deviation -= task.star
     deviation *= deviation
@@ -101,17 +104,14 @@ def judge(task: Task, a: FloatArray) -> Judgement:
     return Judgement(lower, upper, admissible, cost)
 
 
-def candidates(task: Task, last: Vec3 | None) -> FloatArray:
-    """Where a search may start, all inside box and arena: (C, 3)."""
-    starts = [task.a_ref[None], _LATTICE]
+def candidates(task: Task) -> FloatArray:
+    """Ways to go, the reference first, not yet within limits: (C, 3)."""
+    box = task.limits.box_m_s2
+    starts = [task.a_ref[None], box * _LATTICE]
     if len(task.rows):
-        ring = _ring(task.rows)
+        ring = box * _ring(task.rows)
         starts += [ring, 0.5 * ring]
-    if last is not None:
-        starts.insert(0, last[None])
-    together = np.concatenate(starts)
-    together[1 if last is None else 2 :] *= task.limits.box_m_s2
-    return task.limits.clip(together)
+    return np.concatenate(starts)
 
 
 def turned(rows: BarrierRows, a_ref: Vec3) -> Vec3:

@@ -10,8 +10,7 @@ from companion.config import LimitsConfig, SafetyConfig
 from companion.safety.adapt import decay_interval
 from companion.safety.barrier import Barrier
 from companion.safety.filter import FilterInput, SafetyFilter
-from companion.safety.limits import vehicle_limits
-from companion.safety.task import within_reach
+from companion.safety.limits import VehicleLimits, capability, vehicle_limits
 from companion.types import Prediction, Verdict, frozen
 
 SAFETY, LIMITS = SafetyConfig(), LimitsConfig()
@@ -43,6 +42,10 @@ def scenes(draw: st.DrawFn) -> FilterInput:
     return FilterInput(p, rng.normal(0.0, 1.5, 3), rng.uniform(-3.0, 3.0, 3), prediction, elapsed_s=0.05)
 
 
+def limits_of(inputs: FilterInput) -> VehicleLimits:
+    return vehicle_limits(inputs.p_enu, inputs.v_enu, LIMITS, capability(LIMITS, shrink_m_s2=0.0, dt_s=0.05))
+
+
 def admissible_by_grid(inputs: FilterInput) -> bool:
     """Whether some epsilon of a fine grid makes the reference hold every row: cruder than the filter, independent."""
     rows = Barrier(SAFETY).rows(inputs.p_enu, inputs.v_enu, inputs.prediction, 0.0)
@@ -55,7 +58,7 @@ def admissible_by_grid(inputs: FilterInput) -> bool:
 @given(scenes())
 @SETTINGS
 def test_an_admissible_reference_is_unchanged_to_the_bit(inputs: FilterInput) -> None:
-    limits = vehicle_limits(inputs.p_enu, inputs.v_enu, LIMITS, arena_on=True, shrink_m_s2=0.0, dt_s=0.05)
+    limits = limits_of(inputs)
     result = SafetyFilter(SAFETY, LIMITS).step(inputs)
     if admissible_by_grid(inputs) and limits.admits(inputs.a_ref):
         assert result.verdict is Verdict.NOMINAL
@@ -111,8 +114,9 @@ def test_tangents_bound_their_rows_from_below(inputs: FilterInput) -> None:
 @SETTINGS
 def test_obstacles_out_of_reach_never_bind(inputs: FilterInput) -> None:
     rows = Barrier(SAFETY).rows(inputs.p_enu, inputs.v_enu, inputs.prediction, 0.0)
-    limits = vehicle_limits(inputs.p_enu, inputs.v_enu, LIMITS, arena_on=True, shrink_m_s2=0.0, dt_s=0.05)
-    far = rows.select(~within_reach(rows, limits))
+    limits = limits_of(inputs)
+    near = rows.balls(np.ones(len(rows))).reachable(limits.hard_low, limits.hard_high)
+    far = rows.select(np.flatnonzero(~near))
     points = np.random.default_rng(0).uniform(-3.0, 3.0, (100, 3))
     lower, _ = decay_interval(far.evaluate_many(points), far.least_decay)
     assert (lower <= 1.0).all()

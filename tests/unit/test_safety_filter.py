@@ -105,7 +105,7 @@ def test_a_collision_course_is_adjusted_and_every_true_row_holds(solver: str) ->
     assert true_slack(inputs, result) >= -1e-6
     assert {record.track for record in result.rows} >= {"s/0", "s/1", "s/2"}
     assert result.worst == min(result.rows, key=lambda record: record.slack)
-    assert result.solver == solver
+    assert result.solver in {solver, "daqp"}  # which takes over where OSQP does not converge
 
 
 def test_osqp_and_daqp_agree() -> None:
@@ -114,6 +114,7 @@ def test_osqp_and_daqp_agree() -> None:
         SafetyFilter(msgspec.structs.replace(SAFETY, solver=name), LIMITS).step(inputs) for name in ("daqp", "osqp")
     )
     assert one.a_safe == pytest.approx(other.a_safe, abs=1e-3)
+    assert (one.solver, other.solver) == ("daqp", "osqp")
 
 
 def test_the_answer_is_near_the_cheapest_of_a_dense_search() -> None:
@@ -149,18 +150,17 @@ def test_the_relaxed_answer_leaves_more_room_than_any_of_many_others() -> None:
     assert shares(rows, result.a_safe[None])[0] >= shares(rows, others).max() - 1e-3
 
 
-def test_walls_are_kept_while_nobody_is_touched_and_given_up_for_a_contact() -> None:
-    """At the east wall: an obstacle that merely eats the margin does not push through it, one that hits does."""
-    beside, hit = (
+def test_the_arena_gives_way_to_an_obstacle_and_only_as_far_as_it_must() -> None:
+    """At the east wall: an obstacle from the west pushes the vehicle through it, one from the east does not."""
+    west, east = (
         SafetyFilter(SAFETY, LIMITS).step(
-            tick(straight([p], [v]), p=(9.999, 0.0, 5.0), v=(0.0, 0.0, 0.0), a=(0.0, 0.0, 0.0))
+            tick(straight([p], [v]), p=(9.999, 0.0, 5.0), v=(0.0, 0.0, 0.0), a=(3.0, 0.0, 0.0))
         )
-        for p, v in (((9.6, 0.38, 5.0), (2.0, 0.0, 0.0)), ((9.5, 0.0, 5.0), (0.6, 0.0, 0.0)))
+        for p, v in (((9.5, 0.0, 5.0), (0.6, 0.0, 0.0)), ((10.5, 0.0, 5.0), (-0.6, 0.0, 0.0)))
     )
-    assert beside.verdict is Verdict.RELAXED
-    assert min((row.slack for row in beside.rows if row.track == "arena"), default=0.0) >= -1e-6
-    assert hit.verdict is Verdict.RELAXED
-    assert min(row.slack for row in hit.rows if row.track == "arena") < -0.1
+    assert west.verdict is east.verdict is Verdict.RELAXED
+    assert min(row.slack for row in west.rows if row.track == "arena") < -0.1
+    assert min((row.slack for row in east.rows if row.track == "arena"), default=0.0) >= -1e-6
 
 
 def test_arena_floor_and_speed_bind_without_any_obstacle() -> None:
@@ -308,6 +308,6 @@ def test_no_solver_error_leaves_the_filter(monkeypatch: pytest.MonkeyPatch) -> N
     def broken(*_: object) -> None:
         raise SolverError("injected")
 
-    monkeypatch.setattr("companion.safety.filter.solve_task", broken)
+    monkeypatch.setattr("companion.safety.filter.least_of_ways", broken)
     result = SafetyFilter(SAFETY, LIMITS).step(tick(straight([(1.0, 0.0, 2.0)], [(-1.0, 0.0, 0.0)])))
     assert result.verdict is Verdict.BRAKING

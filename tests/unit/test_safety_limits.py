@@ -6,20 +6,22 @@ import numpy as np
 import pytest
 
 from companion.config import LimitsConfig
-from companion.safety.limits import BRAKING_SHARE, VehicleLimits, braking_speed, vehicle_limits
+from companion.safety.limits import BRAKING_SHARE, VehicleLimits, capability, vehicle_limits
+from companion.safety.stopping import Braking
 
 LIMITS = LimitsConfig()
 
 
 def at(p: tuple[float, ...], v: tuple[float, ...], *, arena_on: bool = True, shrink: float = 0.0) -> VehicleLimits:
-    return vehicle_limits(np.array(p), np.array(v), LIMITS, arena_on=arena_on, shrink_m_s2=shrink, dt_s=0.05)
+    can = capability(LIMITS, shrink_m_s2=shrink, dt_s=0.05)
+    return vehicle_limits(np.array(p), np.array(v), LIMITS, can, arena_on=arena_on)
 
 
 def test_braking_speed_by_hand() -> None:
     """2 m/s^2 on a 0.05 s grid: 4 m/s takes 4^2 / 4 + 4 * 0.025 = 4.1 m."""
-    assert braking_speed(4.1, 2.0, 0.05) == pytest.approx(4.0)
-    assert braking_speed(0.0, 2.0, 0.05) == pytest.approx(0.0)
-    assert braking_speed(-0.5, 2.0, 0.05) == pytest.approx(-0.5)
+    assert Braking(2.0, 0.05).speed(4.1) == pytest.approx(4.0)
+    assert Braking(2.0, 0.05).speed(0.0) == pytest.approx(0.0)
+    assert Braking(2.0, 0.05).speed(-0.5) == pytest.approx(-0.5)
 
 
 def test_far_from_everything_only_the_box_is_left() -> None:
@@ -33,7 +35,7 @@ def test_far_from_everything_only_the_box_is_left() -> None:
 def test_near_a_wall_the_bound_is_the_braking_distance() -> None:
     limits = at((9.0, 0.0, 5.0), (1.5, 0.0, 0.0))
     distance = 10.0 - 9.0 - 0.075
-    expected = (braking_speed(distance, BRAKING_SHARE * 3.0, 0.05) - 1.5) / 0.05
+    expected = (Braking(BRAKING_SHARE * 3.0, 0.05).speed(distance) - 1.5) / 0.05
     assert limits.arena_high[0] == pytest.approx(expected)
     slacks = limits.slacks(np.array([expected, 0.0, 0.0]))
     assert slacks["arena"] == pytest.approx(0.0, abs=1e-9)
@@ -54,7 +56,7 @@ def test_full_thrust_at_a_wall_stops_before_it(wall: int) -> None:
     push = 3.0 * np.eye(3)[wall]
     for _ in range(400):
         limits = at(tuple(p), tuple(v))
-        a = limits.clip(push)
+        a = limits.clip(push[None])[0]
         assert min(limits.slacks(a).values()) > -1e-9
         p, v = p + 0.05 * v, v + 0.05 * a
     assert LIMITS.arena_max[wall] - 0.05 < p[wall] <= LIMITS.arena_max[wall] + 1e-9
@@ -83,7 +85,10 @@ def test_bounds_of_opposite_walls_never_cross() -> None:
         arena = LimitsConfig(arena_min=(-width, -width, 0.3), arena_max=(width, width, 0.3 + width))
         shrink = float(rng.choice([0.0, 2.9, 3.0]))
         limits = vehicle_limits(
-            rng.uniform(-20.0, 20.0, 3), rng.normal(0.0, 4.0, 3), arena, arena_on=True, shrink_m_s2=shrink, dt_s=0.05
+            rng.uniform(-20.0, 20.0, 3),
+            rng.normal(0.0, 4.0, 3),
+            arena,
+            capability(arena, shrink_m_s2=shrink, dt_s=0.05),
         )
         assert (limits.low <= limits.high).all()
 
@@ -93,12 +98,12 @@ def test_speed_limit_is_the_norm_after_the_step() -> None:
     assert limits.slacks(np.array([1.0, 0.0, 0.0]))["speed"] == pytest.approx(1.0)
     assert limits.admits(np.array([1.9, 0.0, 0.0]))
     assert not limits.admits(np.array([2.1, 0.0, 0.0]))
-    assert limits.slow(np.array([[2.1, 0.0, 0.0], [0.0, 0.0, 0.0]])) == pytest.approx([0.1, 0.0])
+    assert limits.fast(np.array([[2.1, 0.0, 0.0], [0.0, 0.0, 0.0]])) == pytest.approx([0.1, 0.0])
 
 
 def test_above_the_speed_limit_half_the_box_must_slow_down() -> None:
     limits = at((0.0, 0.0, 5.0), (6.5, 0.0, 0.0), arena_on=False)
-    assert limits.speed_bound_m_s == pytest.approx(6.5 - 0.5 * 3.0 * 0.05)
+    assert limits.speed.radius * 0.05 == pytest.approx(6.5 - 0.5 * 3.0 * 0.05)
     assert limits.admits(np.array([-1.5001, 0.0, 0.0]))
     assert not limits.admits(np.array([-1.4, 0.0, 0.0]))
 
@@ -106,7 +111,7 @@ def test_above_the_speed_limit_half_the_box_must_slow_down() -> None:
 def test_speed_row_is_the_tangent_of_the_limit() -> None:
     limits = at((0.0, 0.0, 5.0), (5.0, 2.0, 0.0))
     a, step = np.array([1.0, -0.5, 0.3]), 1e-5
-    normal, floor = limits.speed_row(a)
+    normal, floor = limits.speed.tangent(a)
     slack = limits.slacks(a)["speed"]
     assert normal @ a - floor == pytest.approx(slack)
     for axis in range(3):
@@ -115,10 +120,10 @@ def test_speed_row_is_the_tangent_of_the_limit() -> None:
         assert normal[axis] == pytest.approx(difference, abs=1e-6)
 
 
-def test_speed_row_of_a_vehicle_at_rest_asks_nothing() -> None:
-    normal, floor = at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0)).speed_row(np.zeros(3))
-    assert normal.tolist() == [0.0, 0.0, 0.0]
-    assert floor < 0.0
+def test_the_speed_tangent_of_a_vehicle_at_rest_is_far_away() -> None:
+    normal, floor = at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0)).speed.tangent(np.zeros(3))
+    assert np.linalg.norm(normal) == pytest.approx(1.0)
+    assert floor == pytest.approx(-6.0 / 0.05)
 
 
 def test_the_speed_limit_is_asked_where_a_corner_of_the_box_breaks_it() -> None:
@@ -128,5 +133,5 @@ def test_the_speed_limit_is_asked_where_a_corner_of_the_box_breaks_it() -> None:
         limits = at((0.0, 0.0, 5.0), tuple(speed * along), arena_on=False)
         corner = np.full((1, 3), 3.0)
         assert limits.may_speed is breaks
-        assert (limits.slow(corner)[0] > 0.0) == breaks
+        assert (limits.fast(corner)[0] > 0.0) == breaks
         assert (float(np.linalg.norm(limits.v_enu + 0.05 * corner)) > 6.0) == breaks

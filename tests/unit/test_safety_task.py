@@ -7,8 +7,8 @@ import pytest
 
 from companion.config import LimitsConfig, SafetyConfig
 from companion.safety.barrier import Barrier, BarrierRows
-from companion.safety.limits import vehicle_limits
-from companion.safety.task import STANDING_M, Task, candidates, judge, turned, within_reach
+from companion.safety.limits import capability, vehicle_limits
+from companion.safety.task import STANDING_M, Task, candidates, judge, turned
 from companion.types import Prediction, frozen
 
 CONFIG = SafetyConfig(kappa=0.0, sigma_delay_s=0.0)
@@ -34,7 +34,8 @@ def rows_of(
 
 
 def task_of(rows: BarrierRows, a_ref: tuple[float, ...] = (1.0, 0.0, 0.0)) -> Task:
-    limits = vehicle_limits(ORIGIN, np.zeros(3), LimitsConfig(), arena_on=True, shrink_m_s2=0.0, dt_s=0.05)
+    can = capability(LimitsConfig(), shrink_m_s2=0.0, dt_s=0.05)
+    limits = vehicle_limits(ORIGIN, np.zeros(3), LimitsConfig(), can)
     return Task(rows, limits, np.array(a_ref), np.zeros(len(rows)), np.full(len(rows), 4.0), CONFIG)
 
 
@@ -44,16 +45,15 @@ def test_far_and_leaving_obstacles_are_out_of_reach() -> None:
         [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (-6.0, 0.0, 0.0), (9.0, 0.0, 0.0)],
     )
     limits = task_of(rows).limits
-    assert within_reach(rows, limits).tolist() == [True, False, True, False]
+    near = rows.balls(np.ones(4)).reachable(limits.hard_low, limits.hard_high)
+    assert near.tolist() == [True, False, True, False]
 
 
-def test_candidates_begin_with_the_last_answer_and_stay_in_the_box() -> None:
-    task = task_of(rows_of([(2.0, 0.0, 0.0)], [(-1.0, 0.0, 0.0)]))
-    starts = candidates(task, np.array([9.0, 0.5, 0.0]))
-    assert starts[0].tolist() == [3.0, 0.5, 0.0]
-    assert starts[1].tolist() == [1.0, 0.0, 0.0]
+def test_candidates_begin_with_the_reference_and_stay_in_the_box() -> None:
+    starts = candidates(task_of(rows_of([(2.0, 0.0, 0.0)], [(-1.0, 0.0, 0.0)])))
+    assert starts[0].tolist() == [1.0, 0.0, 0.0]
     assert np.abs(starts).max() <= 3.0
-    assert candidates(task, None)[0].tolist() == [1.0, 0.0, 0.0]
+    assert len(starts) == 1 + 27 + 16
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_the_ring_lies_across_the_relative_velocity_and_begins_to_the_right(
 ) -> None:
     offset = tuple(-2.0 * component for component in velocity)
     task = task_of(rows_of([offset], [velocity]))
-    ring = candidates(task, None)[1 + 27 : 1 + 27 + 8] / 3.0
+    ring = candidates(task)[1 + 27 : 1 + 27 + 8] / 3.0
     assert ring[0] == pytest.approx(right)
     assert np.linalg.norm(ring, axis=-1) == pytest.approx(np.ones(8))
     assert np.abs(ring @ np.array(velocity)) == pytest.approx(np.zeros(8), abs=1e-12)
@@ -77,7 +77,7 @@ def test_the_ring_lies_across_the_relative_velocity_and_begins_to_the_right(
 
 def test_a_ring_exists_at_rest_and_on_top_of_each_other() -> None:
     for offset in ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)):
-        starts = candidates(task_of(rows_of([offset], [(0.0, 0.0, 0.0)])), None)
+        starts = candidates(task_of(rows_of([offset], [(0.0, 0.0, 0.0)])))
         assert np.isfinite(starts).all()
         assert np.linalg.norm(starts[28:36], axis=-1) == pytest.approx(np.full(8, 3.0))
 
