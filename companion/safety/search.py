@@ -27,6 +27,7 @@ SETTLED_M_S2 = 1e-3  # iterates closer than this have converged: the answer is a
 SETTLED = 0.03  # so has a sequence whose last program saved less than this share of the cost
 MIN_ARM_M_S2 = 1e-3  # an iterate at a ball's very centre has no direction to leave it
 INSET_M_S2 = 1e-7  # tangents are kept by this much, so that the solver's tolerance stays inside the rows
+LEAST_DEVIATION = 0.1  # of epsilon, about which the CLF is linearised at least: at none it would ask nothing
 CHEAP = 0.5  # (m/s^2)^2: a correction this small is not worth another way round
 SETTLED_COST = 1e-3  # (m/s^2)^2: what is left of a correction this small
 _BACK = np.array([[0.0], [0.25], [0.5]])  # shares of a program's step that are judged beside the whole
@@ -68,16 +69,17 @@ def least_of_ways(task: Task, balls: Balls, last: Vec3, order: tuple[str, ...]) 
 def least_cost(task: Task, shared: Form, start: Found, order: tuple[str, ...]) -> Found:
     """The best admissible iterate of a sequence of programs from ``start``; ``start`` itself if none is better.
 
-    Each program is about the greatest epsilon, which asks least of a: what it admits no smaller one refuses for good.
-    The answer has the cheapest.
+    The first program is about the greatest epsilon, which asks least of a, and about the CLF where it begins to cost;
+    the others are about what the one before has found. The answer has the cheapest epsilon.
 
     Raises:
         SolverError: no solver answers the first program, although none proves that there is no answer.
     """
-    best, a, epsilon, alpha2 = start, start.a, start.epsilon, task.config.alpha2
+    best, a, epsilon = start, start.a, start.epsilon
+    about = task.star + np.maximum(np.sqrt(task.budget), LEAST_DEVIATION)
     for count in range(1, task.config.iterations + 1):
         try:
-            x, solver = solve(_tangent_program(task, shared, a, epsilon), order)
+            x, solver = solve(_tangent_program(task, shared, a, epsilon, about), order)
         except SolverError as error:
             if count == 1 and not isinstance(error, Infeasible):
                 raise
@@ -87,10 +89,10 @@ def least_cost(task: Task, shared: Form, start: Found, order: tuple[str, ...]) -
         verdict = judge(task, tried)
         ranked = verdict.ranked
         taken = int(ranked.argmin())
-        a, cost, epsilon = tried[taken], float(ranked[taken]), verdict.greatest(taken, alpha2)
+        a, cost, lower, upper = tried[taken], float(ranked[taken]), verdict.lower[taken], verdict.upper[taken]
+        epsilon = about = np.minimum(np.maximum(x[3 : 3 + len(lower)], lower), upper)
         if cost < best.cost:
-            cheapest = np.minimum(np.maximum(task.star, verdict.lower[taken]), verdict.upper[taken])
-            best = Found(a, cheapest, True, cost, count, solver)
+            best = Found(a, np.minimum(np.maximum(task.star, lower), upper), True, cost, count, solver)
         if best.admissible and (
             before - best.cost < SETTLED * best.cost + SETTLED_COST
             or max(map(abs, (a - previous).tolist())) < SETTLED_M_S2
@@ -136,8 +138,8 @@ def _places(count: int, steps: int) -> tuple[FloatArray, npt.NDArray[np.intp], n
     return empty, row * size + 3 + row // steps, (every + own) * size + 3 + own
 
 
-def _tangent_program(task: Task, shared: Form, a: Vec3, epsilon: FloatArray) -> Program:
-    """(29) about (a, epsilon): variables a, epsilon_j, delta_j.
+def _tangent_program(task: Task, shared: Form, a: Vec3, epsilon: FloatArray, about: FloatArray) -> Program:
+    """(29), rows about (a, epsilon), the CLF about the epsilon ``about``: variables a, epsilon_j, delta_j.
 
     With n the unit vector from a ball's centre c to ``a`` and x = c + rho n, a row is
     n . a + psi(x) alpha2 (epsilon - epsilon_0) / (q rho) >= n . x. Where the ball is smaller than half the way to
@@ -165,10 +167,10 @@ def _tangent_program(task: Task, shared: Form, a: Vec3, epsilon: FloatArray) -> 
     rows[:every, :3] = normal.reshape(3, every).T
     rows.reshape(-1)[shared.slopes] = slope.reshape(every)
     np.add(floor.reshape(every), INSET_M_S2, out=floors[:every])
-    deviation = epsilon - task.star
+    deviation = about - task.star
     tangent = 2.0 * deviation  # of (26): delta - tangent epsilon >= V - budget - tangent epsilon_0
     rows.reshape(-1)[shared.clf] = -tangent
-    floors[every : every + count] = deviation * deviation - task.budget - tangent * epsilon
+    floors[every : every + count] = deviation * deviation - task.budget - tangent * about
     extra, bound = limit_rows(task, a, rows.shape[1])
     return Program(
         shared.weight,
