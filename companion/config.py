@@ -218,6 +218,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "recovery": 0.0,
             "lambda_epsilon": 10.0,
             "lambda_delta": 1e4,
+            "iterations": 10,
         },
     },
     "tracking": {

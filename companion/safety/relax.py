@@ -90,7 +90,8 @@ def least_violation(task: Task, last: Vec3, order: tuple[str, ...]) -> Found:
     alone = min(len(ranks) - 1, budget // 2)
     groups = [ranks[j : j + 1] for j in range(alone)] + [ranks[max(alone, 0) :]]
     x, solver = solve(_share_program(task, a, kept, groups[0]), order)
-    for count in range(1, budget + 1):
+    count = 1
+    while True:
         previous, a = a, limits.clip_hard(x[None, :3])[0]
         settled = float(np.abs(a - previous).max()) < SETTLED_M_S2
         if count == budget or (settled and len(groups) == 1):
@@ -101,6 +102,7 @@ def least_violation(task: Task, last: Vec3, order: tuple[str, ...]) -> Found:
             x, solver = solve(_share_program(task, a, kept, groups[0]), order)
         except SolverError:  # what was kept is no longer to be had to the last digit: the iterate is an answer
             break
+        count += 1
     lower, upper = decay_interval(rows.evaluate(a), rows.least_decay)
     epsilon = np.clip(0.5 * (lower + upper), 0.0, 1.0) / task.config.alpha2
     return Found(a, epsilon, False, np.inf, count, solver)

@@ -135,3 +135,58 @@ def test_the_speed_limit_is_asked_where_a_corner_of_the_box_breaks_it() -> None:
         assert limits.may_speed is breaks
         assert (limits.fast(corner)[0] > 0.0) == breaks
         assert (float(np.linalg.norm(limits.v_enu + 0.05 * corner)) > 6.0) == breaks
+
+
+def test_norm_and_tilt_are_asked_where_a_corner_of_the_box_breaks_them() -> None:
+    """A corner of 3 m/s^2 has a norm of 5.196 and, falling, a tilt of atan(4.243 / 6.807) = 31.94 degrees."""
+    for config, names in (
+        (LimitsConfig(), []),
+        (LimitsConfig(tilt_deg=None), []),
+        (LimitsConfig(norm_m_s2=5.2, tilt_deg=32.0), []),
+        (LimitsConfig(norm_m_s2=5.19, tilt_deg=31.9), ["norm", "tilt"]),
+    ):
+        assert [cone.name for cone in capability(config, shrink_m_s2=0.0, dt_s=0.05).cones] == names
+
+
+def test_authority_is_what_every_direction_has() -> None:
+    tilted = capability(LimitsConfig(tilt_deg=10.0), shrink_m_s2=0.0, dt_s=0.05)
+    assert tilted.authority_m_s2 == pytest.approx(9.80665 * np.sin(np.radians(10.0)))
+    assert tilted.braking.a_m_s2 == pytest.approx(BRAKING_SHARE * tilted.authority_m_s2)
+    assert capability(LimitsConfig(norm_m_s2=1.5), shrink_m_s2=0.5, dt_s=0.05).authority_m_s2 == 1.5
+    assert capability(LimitsConfig(norm_m_s2=9.0), shrink_m_s2=0.5, dt_s=0.05).authority_m_s2 == 2.5
+    directions = np.random.default_rng(0).standard_normal((500, 3))
+    directions *= 0.999 * tilted.authority_m_s2 / np.linalg.norm(directions, axis=1, keepdims=True)
+    assert all((cone.excess(directions) <= 0.0).all() for cone in tilted.cones)
+
+
+def test_slew_is_a_box_about_the_last_setpoint_within_the_other() -> None:
+    config = LimitsConfig(slew_m_s3=10.0)
+    can = capability(config, shrink_m_s2=0.0, dt_s=0.05)
+    p, v, before = np.array([0.0, 0.0, 5.0]), np.zeros(3), np.array([2.9, 0.0, -3.5])
+    limits = vehicle_limits(p, v, config, can, before=before, elapsed_s=0.02)
+    assert limits.low == pytest.approx([2.7, -0.2, -3.0])
+    assert limits.high == pytest.approx([3.0, 0.2, -2.8])
+    assert limits.inside == pytest.approx([2.9, 0.0, -3.0])
+    assert vehicle_limits(p, v, config, can).high == pytest.approx([0.5, 0.5, 0.5])  # from hover, one dt
+    assert not limits.admits(np.array([2.9, 0.21, -3.0]))
+    assert limits.admits(np.array([2.9, 0.19, -3.0]))
+
+
+def test_the_speed_limit_counts_the_time_to_slew_back() -> None:
+    config = LimitsConfig(slew_m_s3=10.0)
+    can = capability(config, shrink_m_s2=0.0, dt_s=0.05)
+    limits = vehicle_limits(np.array([0.0, 0.0, 5.0]), np.array([5.0, 0.0, 0.0]), config, can)
+    a = np.array([1.0 / 0.35, 0.0, 0.0])  # 0.05 s and 3 / 10 s
+    assert limits.slacks(a)["speed"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_limit_tightened_below_the_last_setpoint_has_a_point_inside() -> None:
+    config = LimitsConfig(norm_m_s2=1.0, slew_m_s3=10.0)
+    can = capability(config, shrink_m_s2=0.0, dt_s=0.05)
+    limits = vehicle_limits(np.array([0.0, 0.0, 5.0]), np.zeros(3), config, can, before=np.array([2.0, 0.0, 0.0]))
+    assert limits.inside == pytest.approx([1.0, 0.0, 0.0])
+    assert limits.clip(np.array([[3.0, 3.0, 3.0]]))[0] == pytest.approx(
+        limits.clip_hard(np.array([[3.0, 3.0, 3.0]]))[0]
+    )
+    assert np.linalg.norm(limits.clip(np.array([[3.0, 3.0, 3.0]]))[0]) <= 1.0 + 1e-9
+    assert set(limits.slacks(np.zeros(3))) == {"arena", "floor", "ceiling", "speed", "norm"}
