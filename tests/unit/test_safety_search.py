@@ -165,7 +165,9 @@ def test_limit_rows_are_the_tangents_of_what_may_bind() -> None:
 
 
 @pytest.mark.parametrize(("price", "penalty", "iterations", "factor"), [(0.01, 0.01, 4, 1.05), (10.0, 1e4, 10, 1.4)])
-def test_answers_are_nearly_the_cheapest_of_a_dense_search(price: float, penalty: float, iterations: int) -> None:
+def test_answers_are_nearly_the_cheapest_of_a_dense_search(
+    price: float, penalty: float, iterations: int, factor: float
+) -> None:
     """The dense search refines 4000 random points of true cost. Dear epsilons have several local ways to be cheap."""
     config = SafetyConfig(lambda_epsilon=price, lambda_delta=penalty, iterations=iterations)
     rng, compared = np.random.default_rng(0), 0
