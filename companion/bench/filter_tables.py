@@ -8,7 +8,7 @@ from rich.table import Table
 from companion.bench.chatter import Encounter
 from companion.bench.envelope import Figure
 from companion.bench.filter_timing import FilterTiming
-from companion.bench.programs import ProgramTiming
+from companion.bench.programs import SOLVERS, ProgramTiming
 from companion.bench.tables import figure_table, milliseconds, titled
 from companion.bench.timing import Quantiles
 
@@ -96,11 +96,15 @@ def _programs_table(programs: list[ProgramTiming]) -> Table:
     told.caption = "without those that are infeasible; quadprog without the making of its matrices"
     for timing in programs:
         size = f"{timing.variables} x {timing.rows}"
-        for index, (name, quantiles) in enumerate(timing.solvers.items()):
-            apart = "-" if name == "daqp" else f"{timing.apart[name]:.0e}"
+        names = [name for name in SOLVERS if name in timing.solvers or name in timing.failed]
+        for index, name in enumerate(names):
             head = ("", "") if index else (timing.condition.name, size)
-            failed = timing.failed.get(name, 0)
-            told.add_row(*head, name, str(timing.programs), *_told(quantiles), str(failed), apart)
+            quantiles = timing.solvers.get(name)
+            times = ["-"] * len(_QUANTILES) if quantiles is None else _told(quantiles)
+            apart = f"{timing.apart[name]:.0e}" if name in timing.apart else "-"
+            told.add_row(*head, name, str(timing.programs), *times, str(timing.failed.get(name, 0)), apart)
+        if not names:
+            told.add_row(timing.condition.name, "-", "none seen")
         told.add_section()
     return told
 

@@ -26,6 +26,7 @@ from companion.safety import qp
 from companion.safety.filter import SafetyFilter
 from companion.types import FloatArray
 
+SOLVERS = ("daqp", "osqp", "quadprog")
 FLIGHTS = 400  # at most, where few programs come of a flight
 
 
