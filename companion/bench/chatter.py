@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.bench.scenes import RADIUS_M, Flight, Scene
+from companion.bench.scenes import RADIUS_M, SHRINK_M_S2, Flight, Scene
 from companion.config import LimitsConfig, SafetyConfig
 from companion.safety.filter import SafetyFilter
 from companion.types import FloatArray, Vec3, Verdict
@@ -106,7 +106,7 @@ def _fly(flight: Flight, config: SafetyConfig, rng: np.random.Generator) -> Flig
     corrections, verdicts, clearance_m = [], [], math.inf
     arrived = False
     while not arrived and flight.ticks * config.dt_s < LIMIT_S:
-        a_ref = reference(flight.p_enu, flight.v_enu, limits.acceleration_m_s2)
+        a_ref = reference(flight.p_enu, flight.v_enu, limits.acceleration_m_s2 - SHRINK_M_S2)
         error_m = rng.normal(scale=flight.sigma_m, size=flight.obstacles().shape)
         result = safety_filter.step(flight.inputs(a_ref, error_m=error_m))
         corrections.append(result.a_safe - a_ref)

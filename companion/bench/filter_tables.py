@@ -93,7 +93,9 @@ def _programs_table(programs: list[ProgramTiming]) -> Table:
         "no answer",
         "apart",
     )
-    told.caption = "without those that are infeasible; quadprog without the making of its matrices"
+    infeasible, disputed = sum(each.infeasible for each in programs), sum(each.disputed for each in programs)
+    left_out = f"{infeasible} infeasible ones left out, {disputed} of which quadprog solves"
+    told.caption = f"{left_out}; quadprog without the making of its matrices"
     for timing in programs:
         size = f"{timing.variables} x {timing.rows}"
         names = [name for name in SOLVERS if name in timing.solvers or name in timing.failed]

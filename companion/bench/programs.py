@@ -21,7 +21,6 @@ from companion.bench.scenes import FLIGHT_TICKS, Flight, scenes
 from companion.bench.timing import Quantiles, quantiles
 from companion.clock import stopwatch_ns
 from companion.config import LimitsConfig
-from companion.errors import SolverError
 from companion.safety import qp
 from companion.safety.filter import SafetyFilter
 from companion.types import FloatArray
@@ -32,11 +31,12 @@ FLIGHTS = 400  # at most, where few programs come of a flight
 
 @dataclass(frozen=True, slots=True)
 class ProgramTiming:
-    """Milliseconds of every solver over the same programs, those that DAQP solves."""
+    """Milliseconds of every solver over the same programs, without those that DAQP proves infeasible."""
 
     condition: Condition
     programs: int
-    left_out: int  # DAQP finds no answer: infeasible
+    infeasible: int  # left out
+    disputed: int  # of these, those that quadprog solves
     variables: int  # the most
     rows: int  # the most
     solvers: dict[str, Quantiles]
@@ -106,24 +106,26 @@ def measure_programs(condition: Condition, count: int, *, seed: int = SEED) -> P
     taken: dict[str, list[int]] = {}
     failed: dict[str, int] = {}
     apart: dict[str, float] = {}
-    left_out = 0
+    infeasible = disputed = 0
     for program in found:
-        minimiser, took_ns = _timed(lambda program=program: qp.solve_daqp(program))  # type: ignore[misc]
-        if minimiser is None:
-            left_out += 1
+        answers = {name: _timed(call) for name, call in _calls(program).items()}
+        if answers["daqp"].infeasible:
+            infeasible += 1
+            disputed += "quadprog" in answers and answers["quadprog"].x is not None
             continue
-        taken.setdefault("daqp", []).append(took_ns)
-        for name, call in _others(program).items():
-            x, took_ns = _timed(call)
-            if x is None:
+        ours = answers["daqp"].x
+        for name, answer in answers.items():
+            if answer.x is None:
                 failed[name] = failed.get(name, 0) + 1
                 continue
-            taken.setdefault(name, []).append(took_ns)
-            apart[name] = max(apart.get(name, 0.0), float(np.abs(x - minimiser).max()))
+            taken.setdefault(name, []).append(answer.took_ns)
+            if ours is not None and name != "daqp":
+                apart[name] = max(apart.get(name, 0.0), float(np.abs(answer.x - ours).max()))
     return ProgramTiming(
         condition=condition,
-        programs=len(found) - left_out,
-        left_out=left_out,
+        programs=len(found) - infeasible,
+        infeasible=infeasible,
+        disputed=disputed,
         variables=max((len(program.linear) for program in found), default=0),
         rows=max((len(program.floor) for program in found), default=0),
         solvers={name: quantiles(samples) for name, samples in taken.items()},
@@ -132,18 +134,30 @@ def measure_programs(condition: Condition, count: int, *, seed: int = SEED) -> P
     )
 
 
-def _others(program: qp.Program) -> dict[str, Callable[[], FloatArray | None]]:
-    calls: dict[str, Callable[[], FloatArray | None]] = {"osqp": lambda: qp.solve_osqp(program)}
+def _calls(program: qp.Program) -> dict[str, Callable[[], FloatArray | None]]:
+    calls: dict[str, Callable[[], FloatArray | None]] = {
+        "daqp": lambda: qp.solve_daqp(program),
+        "osqp": lambda: qp.solve_osqp(program),
+    }
     if available():
         calls["quadprog"] = solve_quadprog(program)
     return calls
 
 
-def _timed(call: Callable[[], FloatArray | None]) -> tuple[FloatArray | None, int]:
-    """The answer, None where there is none, and the nanoseconds that it took."""
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    x: FloatArray | None  # None: failed, or infeasible
+    infeasible: bool
+    took_ns: int
+
+
+def _timed(call: Callable[[], FloatArray | None]) -> _Answer:
+    x, infeasible = None, False
     began = stopwatch_ns()
     try:
         x = call()
-    except (SolverError, ValueError):  # quadprog raises ValueError: inconsistent, or a matrix it cannot factor
-        x = None
-    return x, stopwatch_ns() - began
+    except qp.Infeasible:
+        infeasible = True
+    except ValueError:  # quadprog: inconsistent constraints, or a matrix that it cannot factor
+        pass
+    return _Answer(x, infeasible, stopwatch_ns() - began)
