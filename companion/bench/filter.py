@@ -17,7 +17,7 @@ from companion.bench.programs import ProgramTiming
 CONDITIONS = tuple(Condition(obstacles, horizon) for horizon in (5, 20) for obstacles in (1, 10, 20, 100))
 HEADLINE = (Condition(10, 5), Condition(20, 5), Condition(10, 20), Condition(100, 20))  # those with figures
 STATES, QUICK_STATES = 2000, 150  # of a condition
-PROGRAMS, QUICK_PROGRAMS = 1000, 30
+PROGRAMS, QUICK_PROGRAMS = 1200, 30  # some are infeasible
 QUICK_FLIGHTS = 2
 BESIDE_CBFPY = Condition(20, 5)
 

@@ -66,7 +66,7 @@ def _states_table(times: list[FilterTiming]) -> Table:
         "adjusted",
         "relaxed",
         "braking",
-        "programs a state",
+        "programs",
         "adjusted p50 [ms]",
         "p99",
         "relaxed p50",
@@ -93,9 +93,10 @@ def _programs_table(programs: list[ProgramTiming]) -> Table:
         "no answer",
         "apart",
     )
-    infeasible, disputed = sum(each.infeasible for each in programs), sum(each.disputed for each in programs)
-    left_out = f"{infeasible} infeasible ones left out, {disputed} of which quadprog solves"
-    told.caption = f"{left_out}; quadprog without the making of its matrices"
+    told.caption = f"{sum(timing.infeasible for timing in programs)} infeasible ones left out"
+    if any("quadprog" in timing.solvers for timing in programs):
+        told.caption += f", {sum(timing.disputed for timing in programs)} of which quadprog solves"
+        told.caption += "; quadprog without the making of its matrices"
     for timing in programs:
         size = f"{timing.variables} x {timing.rows}"
         names = [name for name in SOLVERS if name in timing.solvers or name in timing.failed]

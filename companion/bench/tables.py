@@ -39,7 +39,7 @@ def print_tracking(
 def titled(title: str, *columns: str) -> Table:
     """A table whose first column is text, the others aligned to the right."""
     table = Table(title=title, title_justify="left", title_style="bold")
-    table.add_column(columns[0])
+    table.add_column(columns[0], no_wrap=True)
     for column in columns[1:]:
         table.add_column(column, justify="right")
     return table
