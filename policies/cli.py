@@ -18,7 +18,7 @@ from companion.policy import artifact_folder
 
 TRAIN_EXAMPLE = "example: policies train --seed 1 --out runs/first && policies evaluate runs/first/artifact"
 EVALUATE_EXAMPLE = "example: policies evaluate builtin:default --starts 200 --json"
-ENCOUNTERS_EXAMPLE = "example: policies encounters --obstacles 1 --flights 2000 --noise 0.2236 --seed 20000 --json"
+ENCOUNTERS_EXAMPLE = "example: policies encounters --flights 2000 --noise 0.2236 --json"
 
 
 class _Parser(argparse.ArgumentParser):
