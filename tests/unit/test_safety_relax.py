@@ -11,7 +11,7 @@ from companion.errors import SolverError
 from companion.safety import qp, relax
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.safety.relax import braking, by_contact, least_violation, shares, widest
-from companion.safety.task import Task
+from companion.safety.task import Task, Ways
 from companion.types import Prediction, Verdict, frozen
 
 SAFETY = SafetyConfig(sigma_delay_s=0.0, kappa=0.0)
@@ -75,7 +75,7 @@ def test_the_widest_way_touches_nobody_first_and_then_gives_the_first_obstacle_i
 def test_the_first_obstacle_keeps_what_it_can_and_the_second_what_is_left() -> None:
     """Against a dense search over the box, lexicographic to a hundredth."""
     task = task_of(inputs_of([(1.9, 0.1, 0.0), (2.3, -0.6, 0.1)], [(-1.0, 0.0, 0.0)] * 2))
-    found = least_violation(task, np.zeros(3), ("daqp", "osqp"))
+    found = least_violation(task, Ways(task, np.zeros(3)), ("daqp", "osqp"))
     first, second = shares(task.rows, found.a[None])[0]
     dense = np.random.default_rng(0).uniform(-3.0, 3.0, (60_000, 3))
     offered = shares(task.rows, dense)
@@ -90,7 +90,7 @@ def test_the_first_obstacle_keeps_what_it_can_and_the_second_what_is_left() -> N
 def test_nobody_is_touched_for_the_margin_of_another() -> None:
     """Between two spheres side by side, through a gap too narrow for both margins: contact with neither."""
     task = task_of(inputs_of([(1.6, 0.47, 0.0), (1.7, -0.43, 0.0)], [(-2.0, 0.0, 0.0)] * 2, radius=0.2))
-    found = least_violation(task, np.zeros(3), ("daqp",))
+    found = least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
     assert shares(task.rows, found.a[None]).min() >= -1e-3
 
 
@@ -102,7 +102,7 @@ def test_the_budget_is_kept_with_many_obstacles(iterations: int, monkeypatch: py
     ring = [(1.2, y, z) for y in (-0.4, 0.0, 0.4) for z in (-0.4, 0.0, 0.4)]
     config = msgspec.structs.replace(SAFETY, iterations=iterations)
     task = task_of(inputs_of(ring, [(-2.0, 0.0, 0.0)] * 9), config=config)
-    found = least_violation(task, np.zeros(3), ("daqp",))
+    found = least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
     assert found.iterations == len(calls) <= iterations
     assert np.isfinite(found.a).all()
     assert np.abs(found.a).max() <= 3.0
@@ -123,13 +123,13 @@ def test_what_the_vehicle_cannot_do_is_kept() -> None:
 def test_speed_gives_way_before_the_arena_and_the_arena_before_the_obstacle() -> None:
     """Each stands alone against the next: what may be broken by a lot is broken by nothing where it need not be."""
     fast = task_of(inputs_of([], [], at=(9.0, 0.0, 5.0), speed=(6.5, 0.0, 0.0), a_ref=(3.0, 0.0, 0.0)))
-    alone = least_violation(fast, np.zeros(3), ("daqp",))
+    alone = least_violation(fast, Ways(fast, np.zeros(3)), ("daqp",))
     assert alone.a[0] == pytest.approx(-3.0, abs=1e-6)  # all of the box towards the inside
     chased = task_of(
         inputs_of([(-0.9, 0.0, 0.0)], [(7.5, 0.0, 0.0)], at=(0.0, 0.0, 5.0), speed=(6.0, 0.0, 0.0)),
         LimitsConfig(arena_min=(-50.0, -50.0, 0.3), arena_max=(50.0, 50.0, 20.0)),
     )
-    found = least_violation(chased, np.zeros(3), ("daqp",))
+    found = least_violation(chased, Ways(chased, np.zeros(3)), ("daqp",))
     assert (
         shares(chased.rows, found.a[None])[0, 0]
         >= shares(chased.rows, np.random.default_rng(2).uniform(-3.0, 3.0, (20_000, 3))).max() - 0.01
@@ -140,29 +140,30 @@ def test_a_solver_that_fails_after_the_first_program_leaves_its_answer(monkeypat
     real, calls = qp.solve_daqp, iter(range(9))
     monkeypatch.setitem(qp.BACKENDS, "daqp", lambda program: real(program) if next(calls) < 1 else None)
     task = task_of(inputs_of([(1.2, 0.1, 0.0), (1.4, -0.3, 0.0)], [(-2.0, 0.0, 0.0)] * 2))
-    found = least_violation(task, np.zeros(3), ("daqp",))
+    found = least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
     assert found.iterations == 1
     with pytest.raises(SolverError):
-        least_violation(task, np.zeros(3), ("daqp",))
+        least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
 
 
 def test_the_way_of_the_last_answer_is_kept_unless_another_is_much_wider() -> None:
     task = task_of(inputs_of([(1.0, 0.0, 0.0)], [(-2.0, 0.0, 0.0)]))
-    left = least_violation(task, np.array([-3.0, 3.0, 3.0]), ("daqp",))
-    right = least_violation(task, np.array([-3.0, -3.0, -3.0]), ("daqp",))
+    left = least_violation(task, Ways(task, np.array([-3.0, 3.0, 3.0])), ("daqp",))
+    right = least_violation(task, Ways(task, np.array([-3.0, -3.0, -3.0])), ("daqp",))
     assert left.a[1] > 1.0
     assert right.a[1] < -1.0
 
 
 def test_braking_takes_the_admissible_then_the_widest_then_the_slowest() -> None:
     free = task_of(inputs_of([(8.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)]))
-    stop = braking(free, np.zeros(3))
+    stop = braking(free, Ways(free, np.zeros(3)))
     assert stop.admissible
     assert stop.a == pytest.approx([-3.0, 0.0, 0.0])
-    slow = braking(task_of(inputs_of([(8.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)], speed=(0.1, 0.0, 0.0))), np.zeros(3))
+    creeping = task_of(inputs_of([(8.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)], speed=(0.1, 0.0, 0.0)))
+    slow = braking(creeping, Ways(creeping, np.zeros(3)))
     assert slow.a == pytest.approx([-2.0, 0.0, 0.0])  # to rest in one step, and no further
     tight = task_of(inputs_of([(1.0, 0.1, 0.0)], [(-2.0, 0.0, 0.0)]))
-    found = braking(tight, np.zeros(3))
+    found = braking(tight, Ways(tight, np.zeros(3)))
     assert not found.admissible
     offered = shares(tight.rows, np.random.default_rng(0).uniform(-3.0, 3.0, (5000, 3)))
     assert shares(tight.rows, found.a[None])[0, 0] >= offered.max() - 0.3

@@ -9,9 +9,10 @@ import pytest
 from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
 from companion.safety import qp, search
+from companion.safety import task as task_module
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.safety.search import form, least_cost, least_of_ways, limit_rows
-from companion.safety.task import Found, Task, judge
+from companion.safety.task import Found, Task, Ways, judge
 from companion.types import Prediction, Verdict, frozen
 
 ORDER = ("daqp", "osqp")
@@ -174,7 +175,7 @@ def test_answers_are_nearly_the_cheapest_of_a_dense_search(
     for seed in range(14):
         inputs = random_inputs(seed, 2, config)
         task = task_of(inputs, config)
-        found = least_of_ways(task, task.rows.balls(np.ones(2)), task.a_ref, ORDER)
+        found = least_of_ways(task, task.rows.balls(np.ones(2)), Ways(task, task.a_ref), ORDER)
         points = task.limits.clip(rng.uniform(-3.0, 3.0, (4000, 3)))
         for spread in (0.3, 0.1, 0.03, 0.01):
             ranked = judge(task, points).ranked
@@ -226,8 +227,8 @@ def test_a_small_correction_looks_for_no_other_way(monkeypatch: pytest.MonkeyPat
     config = SafetyConfig()
     task = task_of(random_inputs(0, 1, config, close=False), config)
     asked = []
-    monkeypatch.setattr(search, "candidates", lambda *_: asked.append(1))
-    found = least_of_ways(task, task.rows.balls(np.ones(1)), task.a_ref, ORDER)
+    monkeypatch.setattr(task_module, "candidates", lambda *_: asked.append(1))
+    found = least_of_ways(task, task.rows.balls(np.ones(1)), Ways(task, task.a_ref), ORDER)
     assert found.cost <= search.CHEAP
     assert not asked
 
@@ -249,6 +250,6 @@ def test_a_cheaper_way_round_is_taken() -> None:
     guard = SafetyFilter(config, LimitsConfig())
     inputs = FilterInput(np.array([0.0, 0.0, 5.0]), np.array([2.0, 0.0, 0.0]), np.zeros(3), prediction)
     task = guard.build(inputs)
-    found = least_of_ways(task, task.rows.balls(np.ones(1)), np.array([0.0, 3.0, 0.0]), ORDER)
+    found = least_of_ways(task, task.rows.balls(np.ones(1)), Ways(task, np.array([0.0, 3.0, 0.0])), ORDER)
     assert found.a[1] < 0.0  # the obstacle is to the left of the path
     assert guard.step(inputs).verdict is Verdict.ADJUSTED
