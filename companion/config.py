@@ -131,8 +131,8 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     lambda_delta: Positive = 0.01
     drone_radius_m: Positive = 0.2
     cushion_m: NonNegative = 0.1
-    kappa: NonNegative = 2.1
-    sigma_growth_s: NonNegative = 0.9  # predicted sigma counts up to this far ahead; the next looks correct the rest
+    kappa: NonNegative = 2.2
+    sigma_growth_s: NonNegative = 0.7  # predicted sigma counts up to this far ahead; the next looks correct the rest
     sigma_cap_m: Positive = 2.0  # kappa sigma counts no further than this: a track just born is no wall
     sigma_delay_s: NonNegative = 0.01
     braking: bool = True  # brake before what is too large to swerve round within the horizon
