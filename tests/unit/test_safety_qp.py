@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -57,7 +59,7 @@ def test_solvers_agree_on_random_programs(seed: int) -> None:
 
 @pytest.mark.parametrize("name", ["daqp", "osqp"])
 def test_an_infeasible_program_is_named_so(name: str) -> None:
-    with pytest.raises(Infeasible, match="^infeasible: 2 variables, 2 rows$"):
+    with pytest.raises(Infeasible, match=r"^infeasible: 2 variables, 2 rows$"):
         solve(program([[1.0, 0.0], [-1.0, 0.0]], [1.0, 1.0]), (name,))
 
 
@@ -81,7 +83,7 @@ def test_the_other_solver_takes_over(monkeypatch: pytest.MonkeyPatch, wrong: np.
 def test_both_failing_is_a_solver_error(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("daqp", "osqp"):
         monkeypatch.setitem(qp.BACKENDS, name, lambda _: None)
-    with pytest.raises(SolverError, match="^no answer from daqp, osqp: 2 variables, 0 rows$"):
+    with pytest.raises(SolverError, match=r"^no answer from daqp, osqp: 2 variables, 0 rows$"):
         solve(program([], []), ("daqp", "osqp"))
 
 
@@ -117,13 +119,8 @@ def test_osqp_is_polished_and_silent(capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_what_a_solver_names_otherwise_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Stopped:
-        class info:  # noqa: N801
-            status = "maximum iterations reached"
-
-        x = np.zeros(2)
-
-    monkeypatch.setattr(qp.osqp.OSQP, "solve", lambda *_, **__: Stopped)
+    stopped = SimpleNamespace(info=SimpleNamespace(status="maximum iterations reached"), x=np.zeros(2))
+    monkeypatch.setattr(qp.osqp.OSQP, "solve", lambda *_, **__: stopped)
     assert solve_osqp(program([], [])) is None
 
 
