@@ -43,6 +43,7 @@ def test_clf_budget_halves_each_twentieth_of_a_second() -> None:
         ((-0.2, 0.1), (1.0, -1.0), (0.2, 0.1)),  # empty
         ((-1.5,), (1.0,), (1.5, 1.0)),  # beyond 1: empty
         ((0.1,), (0.0,), (0.0, 1.0)),
+        ((1.5,), (-1.0,), (0.0, 1.0)),  # leaving faster than any decay asks
     ],
 )
 def test_decay_interval_by_hand(rise: tuple[float, ...], psi: tuple[float, ...], expected: tuple[float, float]) -> None:
