@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import msgspec
 import numpy as np
 import pytest
@@ -120,7 +122,7 @@ def test_a_row_that_always_holds_has_a_plane_that_refuses_nothing() -> None:
 def test_the_clf_row_is_the_tangent_of_26() -> None:
     """delta >= V(e) - budget about e = 0.8, V = (e - star)^2: at 0.8 itself to the digit, below V elsewhere."""
     config = SafetyConfig(horizon=4)
-    task = task_of(random_inputs(1, 2, config), config)
+    task = dataclasses.replace(task_of(random_inputs(1, 2, config), config), star=np.array([0.3, 0.1]))
     about = np.array([0.8, 1.4])
     balls = task.rows.balls(np.ones(2))
     program = search._tangent_program(task, form(task, balls), HOVER, np.full(2, 2.0), about)
@@ -329,6 +331,10 @@ def test_stops_have_a_row_where_they_may_bind() -> None:
     assert program.rows[-1].tolist() == rows[0].tolist()
     assert program.floor[-1] == -0.7
     assert len(program.rows) == len(program.floor) == 2 * 5 + 2 + 1
+    normed = task_of(random_inputs(3, 2, config), config, LimitsConfig(norm_m_s2=2.0))
+    rows, floors = limit_rows(dataclasses.replace(normed, stops=stops), HOVER, 7)
+    assert rows[:, :3].tolist() == [[-1.0, 0.0, 0.0], [0.6, 0.8, 0.0]]
+    assert floors.tolist() == [-2.0, -0.7]
 
 
 class Programs:
@@ -393,6 +399,8 @@ def test_the_clf_is_linearised_a_tenth_from_its_target_at_least(monkeypatch: pyt
         ([(-2.0, 0.0, 0.0), (-2.0, 1.5, 0.0), (-2.0, 1.5, 1.0)], 2),  # the second saves nothing
         ([(-2.0, 0.0, 0.0), (-1.5, 0.0, 0.0), (-1.0, 0.0, 0.0)], 3),  # each saves
         ([(-2.0, 0.0, 0.0), (-1.98, 0.0, 0.0), (-1.0, 0.0, 0.0)], 2),  # the second less than 3 %
+        ([(0.05, 0.0, 0.0), (0.04, 0.0, 0.0), (0.0, 0.0, 0.0)], 2),  # less than 1e-3 (m/s^2)^2
+        ([(0.05, 0.0, 0.0), (0.03, 0.0, 0.0), (0.0, 0.0, 0.0)], 3),
     ],
 )
 def test_a_sequence_ends_where_it_saves_no_more(
