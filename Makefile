@@ -12,8 +12,11 @@ ifeq ($(shell command -v $(PYTHON) 2>/dev/null),)
 PYTHON := python3
 endif
 
+SAFETY_TESTS := tests/unit/test_safety_*.py tests/property/test_safety_properties.py
+PILOT_TESTS := tests/unit/test_pilot.py tests/unit/test_disturbance.py
+
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow check format clean
+.PHONY: help demo test test-slow coverage mutants check format clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' Makefile
@@ -32,11 +35,23 @@ $(VENV)/dev.stamp: pyproject.toml constraints.txt
 demo: $(VENV)/sim.stamp  ## fly the simulated vehicle through three crossing obstacles
 	$(BIN)/companion demo
 
-test: $(VENV)/dev.stamp  ## run the tests (without those marked slow)
+test: $(VENV)/dev.stamp coverage  ## run the tests (without those marked slow)
 	$(BIN)/python -m pytest -m 'not slow'
 
 test-slow: $(VENV)/dev.stamp  ## run every test
 	$(BIN)/python -m pytest
+
+coverage: $(VENV)/dev.stamp  ## every branch of the safety layer and the pilot is covered by their own tests
+	$(BIN)/coverage run --branch --include='companion/safety/*,companion/pilot.py' -m pytest $(SAFETY_TESTS) $(PILOT_TESTS)
+	$(BIN)/coverage report --fail-under=100 -m
+
+# one thread each: two mutants run beside one another, and a result must not depend on the number of cores
+mutants: export OMP_NUM_THREADS = 1
+mutants: export OPENBLAS_NUM_THREADS = 1
+mutants: $(VENV)/dev.stamp  ## mutation tests of the safety layer (half an hour): at least 90 % must be killed
+	rm -rf mutants
+	$(BIN)/mutmut run --max-children 2
+	$(BIN)/python tests/mutation/report.py
 
 check: $(VENV)/dev.stamp  ## lint, format check, types
 	$(BIN)/ruff check .
@@ -48,4 +63,4 @@ format: $(VENV)/dev.stamp  ## format the code
 	$(BIN)/ruff format .
 
 clean:  ## remove the virtual environment and caches
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage mutants

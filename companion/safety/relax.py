@@ -122,21 +122,21 @@ def _share_program(task: Task, a: Vec3, kept: FloatArray, raised: npt.NDArray[np
     normal = r * (rows.reach[2:] / distance)
     floor = (a @ normal.reshape(3, -1)).reshape(distance.shape) - distance + rows.radii_m[:, None]
     margins = _margins(rows)
-    # of every obstacle what is kept, over the horizon and at its end; of those raised t, and t at the end
-    every, count, high = floor.size, len(rows), len(raised)
-    steps = floor.shape[1]
-    tangents, floors = _limit_part(task, a, every + count + high * (steps + 1))
+    # limits; of every obstacle what is kept, over the horizon and at its end; of those raised t, and t at the end
+    count, steps, high = len(rows), floor.shape[1], len(raised)
+    tangents, floors, first = _limit_part(task, a, (count + high) * (steps + 1))
     planes, least = normal.reshape(3, -1).T, np.maximum(kept, -UNKEPT)
-    tangents[:every, :3] = planes
-    floors[:every] = (floor + least[:, :1] * margins).reshape(-1)
-    at, last = every + count, planes[steps - 1 :: steps]
-    tangents[every:at, :3] = last
-    floors[every:at] = floor[:, -1] + least[:, 1] * margins[:, -1]
-    to = at + high * steps
-    tangents[at:to, :3], tangents[at:to, 3] = normal[:, raised].reshape(3, -1).T, -margins[raised].reshape(-1)
-    floors[at:to] = floor[raised].reshape(-1)
-    tangents[to : to + high, :3], tangents[to : to + high, 4] = last[raised], -margins[raised, -1]
-    floors[to : to + high] = floor[raised, -1]
+    last, at = planes[steps - 1 :: steps], first + floor.size
+    tangents[first:at, :3] = planes
+    floors[first:at] = (floor + least[:, :1] * margins).reshape(-1)
+    end = at + count
+    tangents[at:end, :3] = last
+    floors[at:end] = floor[:, -1] + least[:, 1] * margins[:, -1]
+    to = end + high * steps
+    tangents[end:to, :3], tangents[end:to, 3] = normal[:, raised].reshape(3, -1).T, -margins[raised].reshape(-1)
+    floors[end:to] = floor[raised].reshape(-1)
+    tangents[to:, :3], tangents[to:, 4] = last[raised], -margins[raised, -1]
+    floors[to:] = floor[raised, -1]
     return Program(
         weight=np.full(_VARIABLES, 2.0),
         linear=np.array([*(-2.0 * task.a_ref), -SHARE_WEIGHT, -LEAVE_WEIGHT, STOP_WEIGHT, ARENA_WEIGHT, SPEED_WEIGHT]),
@@ -147,22 +147,23 @@ def _share_program(task: Task, a: Vec3, kept: FloatArray, raised: npt.NDArray[np
     )
 
 
-def _limit_part(task: Task, a: Vec3, before: int) -> tuple[FloatArray, FloatArray]:
-    """Behind room for ``before`` rows: cones (kept), speed, stops and arena (each with what it is broken by)."""
+def _limit_part(task: Task, a: Vec3, after: int) -> tuple[FloatArray, FloatArray, int]:
+    """Cones (kept), speed, stops, arena (each with what it is broken by), room for ``after`` rows, where that begins."""
     limits = task.limits
     extra, bound = limit_rows(task, a, _VARIABLES)
-    end = before + len(extra)
-    tangents, floors = np.zeros((end + 6, _VARIABLES)), np.empty(end + 6)
-    tangents[before:end], floors[before:end] = extra, bound
-    first = before + len(limits.cones)
+    walls = len(extra)
+    first = walls + 6
+    tangents, floors = np.zeros((first + after, _VARIABLES)), np.empty(first + after)
+    tangents[:walls], floors[:walls] = extra, bound
+    kept = len(limits.cones)
     if limits.may_speed:
-        tangents[first, _SPEED] = 1.0
-        first += 1
-    tangents[first:end, _STOP] = 1.0
-    tangents[end:, :3], tangents[end:, _ARENA] = _WALLS, 1.0
-    floors[end : end + 3], floors[end + 3 :] = limits.arena_low, -limits.arena_high
-    np.maximum(floors[end:], -UNBOUNDED, out=floors[end:])
-    return tangents, floors
+        tangents[kept, _SPEED] = 1.0
+        kept += 1
+    tangents[kept:walls, _STOP] = 1.0
+    tangents[walls:first, :3], tangents[walls:first, _ARENA] = _WALLS, 1.0
+    floors[walls : walls + 3], floors[walls + 3 : first] = limits.arena_low, -limits.arena_high
+    np.maximum(floors[walls:first], -UNBOUNDED, out=floors[walls:first])
+    return tangents, floors, first
 
 
 def braking(task: Task, ways: Ways) -> Found:

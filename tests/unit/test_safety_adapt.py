@@ -19,6 +19,7 @@ CONFIG = SafetyConfig()
         ((4.0, 0.0, 0.0), (2.0, 0.0, 0.0), 1.0),  # separating: 2 * 2 / 4
         ((3.0, 4.0, 0.0), (0.0, 1.0, 0.0), 2.0 * 0.8 / 5.0),  # cosine 4/5
         ((1.0, 0.0, 0.0), (5.0, 0.0, 0.0), 2.0),  # no more than 1 / alpha2
+        ((0.5, 0.0, 0.0), (0.4, 0.0, 0.0), 1.6),  # near: 2 * 0.4 / 0.5
         ((2.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0),
         ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0),  # on top of each other: defined, and strict
     ],
@@ -42,6 +43,7 @@ def test_clf_budget_halves_each_twentieth_of_a_second() -> None:
         ((-0.2, 0.1), (1.0, -1.0), (0.2, 0.1)),  # empty
         ((-1.5,), (1.0,), (1.5, 1.0)),  # beyond 1: empty
         ((0.1,), (0.0,), (0.0, 1.0)),
+        ((1.5,), (-1.0,), (0.0, 1.0)),  # leaving faster than any decay asks
     ],
 )
 def test_decay_interval_by_hand(rise: tuple[float, ...], psi: tuple[float, ...], expected: tuple[float, float]) -> None:
@@ -73,3 +75,18 @@ def test_inside_the_keep_out_distance_the_decay_has_a_floor() -> None:
     assert lower[0] > upper[0]
     leaving = decay_interval(np.stack((rise + 0.01, psi)), np.array([0.02]))
     assert (leaving[0][0], leaving[1][0]) == pytest.approx((0.02, 0.1))
+
+
+def test_rows_that_open_those_that_close_and_a_zero_together() -> None:
+    """Two obstacles of three rows: psi 0 asks for rise >= 0 alone, beside psi < 0 and psi > 0."""
+    rise = np.array([[0.1, 0.3, -0.2], [0.4, 0.2, 0.5]])
+    psi = np.array([[0.0, -1.0, 2.0], [0.0, -0.5, 1.0]])
+    lower, upper = decay_interval(np.stack((rise, psi)), np.array([0.0, 0.05]))
+    assert lower == pytest.approx([0.1, 0.05])
+    assert upper == pytest.approx([0.3, 0.4])
+
+
+def test_a_floor_applies_where_no_row_closes() -> None:
+    lower, upper = decay_interval(np.array([[[0.2], [-0.4]], [[1.0], [1.0]]]), np.array([0.3, 0.1]))
+    assert lower == pytest.approx([0.3, 0.4])
+    assert upper.tolist() == [1.0, 1.0]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.config import SafetyConfig
-from companion.safety.barrier import Barrier, monomials
+from companion.safety.barrier import Balls, Barrier, monomials
 from companion.types import Prediction, frozen
 
 P, V = np.array([0.2, -0.1, 2.0]), np.array([1.5, 0.3, -0.2])
@@ -158,3 +158,167 @@ def test_rows_are_convex_in_the_acceleration_for_every_decay() -> None:
 
 def test_monomials_are_one_a_and_half_its_square() -> None:
     assert monomials(np.array([[1.0, 2.0, -2.0]])).tolist() == [[1.0], [1.0], [2.0], [-2.0], [4.5]]
+
+
+def test_the_grid_by_hand() -> None:
+    """c_k = p + k dt v - o_k and s_k = dt^2 k (k - 1) / 2; r_k = c_k + s_k a for one acceleration and for several."""
+    config = SafetyConfig(horizon=2, dt_s=0.1)
+    prediction = make_prediction(config, count=2)
+    rows = Barrier(config).rows(P, V, prediction, 0.0)
+    assert rows.reach == pytest.approx([0.0, 0.0, 0.01, 0.03, 0.06])
+    assert rows.drift.shape == (3, 2, 5)
+    for j in range(2):
+        for k in range(5):
+            assert rows.drift[:, j, k] == pytest.approx(P + 0.1 * k * V - prediction.p_enu[j, k])
+    points = np.array([[1.0, -2.0, 3.0], [0.5, 0.0, -1.0], [0.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
+    many = rows.positions(points)
+    assert many.shape == (3, 4, 2, 3)
+    for c, a in enumerate(points):
+        one = rows.positions(a)
+        assert many[:, c] == pytest.approx(one)
+        for i in range(3):
+            assert one[:, 1, i] == pytest.approx(rows.drift[:, 1, i + 2] + rows.reach[i + 2] * a)
+
+
+def test_what_a_row_is_made_of() -> None:
+    config = SafetyConfig()
+    prediction = make_prediction(config)
+    rows = Barrier(config).rows(P, V, prediction, 0.0)
+    assert (len(rows), rows.ids) == (3, ("s/0", "s/1", "s/2"))
+    assert rows.radii_m == pytest.approx(prediction.radius_m + 0.2)
+    assert rows.cushion_m == 0.1
+    a = np.array([0.3, -0.7, 1.1])
+    basis = np.array([1.0, *a, 0.5 * float(a @ a)])
+    rise, psi = rows.evaluate(a)
+    assert np.tensordot(basis, rows.rise, 1) == pytest.approx(rise)
+    assert np.tensordot(basis, rows.psi, 1) == pytest.approx(psi)
+    assert rows.evaluate_many(a[None]).shape == (2, 1, 3, 21)
+    assert rows.evaluate_many(np.zeros((4, 3))).shape == (2, 4, 3, 21)
+
+
+@pytest.mark.parametrize("growth_s", [0.0, 0.05, 0.1, 0.5, 9.0])
+def test_sigma_counts_up_to_the_end_of_its_growth(growth_s: float) -> None:
+    """Instants 2, 3, ... up to the growth's end, which may lie before the first and behind the last of them."""
+    config = SafetyConfig(horizon=12, sigma_growth_s=growth_s, kappa=2.0)
+    prediction = make_prediction(config)
+    rows = Barrier(config).rows(P, V, prediction, 0.2)
+    for i in range(13):
+        instant = min(i + 2, round(growth_s / 0.05))
+        assert rows.sigma_m[1, i] == pytest.approx(2.0 * math.hypot(prediction.sigma_m[1, instant], 0.2))
+
+
+def test_sigma_counts_no_further_than_its_cap_and_the_letter_of_22_takes_the_square_root_of_two() -> None:
+    for form, factor in (("sphere", 1.0), ("paper", math.sqrt(2.0))):
+        config = SafetyConfig(kappa=2.0, sigma_cap_m=0.25, form=form)
+        prediction = make_prediction(config, sigma=0.11)
+        rows = Barrier(config).rows(P, V, prediction, 0.0)
+        assert rows.sigma_m[:, 0] == pytest.approx([0.242] * 3)  # 2 * 0.11 * 1.1
+        assert rows.sigma_m[:, 5] == pytest.approx([0.25] * 3)
+        for step in (0, 5):
+            total = np.array([margin.total for margin in rows.margins(np.full(3, step))])
+            assert rows.keep_out_m[:, step] == pytest.approx(factor * total)
+
+
+def test_margins_are_those_of_each_obstacle_at_its_own_step() -> None:
+    config = SafetyConfig()
+    rows = Barrier(config).rows(P, V, make_prediction(config), 0.0)
+    for j, (margin, step) in enumerate(zip(rows.margins(np.array([0, 3, 6])), (0, 3, 6), strict=True)):
+        assert margin.radii == rows.radii_m[j]
+        assert margin.sigma == rows.sigma_m[j, step]
+        assert margin.delay == rows.delay_m[j]
+        assert margin.cushion == 0.1
+
+
+def test_inside_the_keep_out_distance_there_is_a_least_decay() -> None:
+    config = SafetyConfig(kappa=0.0, sigma_delay_s=0.0, recovery=0.07)
+    start = np.array([[0.45, 0.0, 0.0], [0.55, 0.0, 0.0]])
+    prediction = Prediction(
+        0,
+        0.05,
+        ("in", "out"),
+        frozen(np.repeat(start[:, None], 23, axis=1)),
+        frozen(np.zeros((2, 23))),
+        frozen(np.zeros((2, 3))),
+        frozen(np.zeros((2, 3))),
+        frozen([0.2, 0.2]),
+    )
+    rows = Barrier(config).rows(np.zeros(3), np.zeros(3), prediction, 0.0)
+    assert rows.least_decay.tolist() == [0.07, 0.0]
+    assert rows.psi[0, 0, 0] == pytest.approx(0.8 * 0.5 * (0.45**2 - 0.5**2))  # alpha1 h
+
+
+def same(one: object, other: object, names: tuple[str, ...]) -> None:
+    for name in names:
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_a_selection_is_what_those_obstacles_alone_would_have() -> None:
+    config = SafetyConfig()
+    whole = make_prediction(config, count=4)
+    kept = [3, 1]
+    part = Prediction(
+        0,
+        config.dt_s,
+        tuple(whole.ids[index] for index in kept),
+        *(frozen(array[kept]) for array in (whole.p_enu, whole.sigma_m, whole.v_enu, whole.a_enu, whole.radius_m)),
+    )
+    barrier, decay = Barrier(config), np.array([0.2, 0.4, 0.6, 0.8])
+    rows, alone = barrier.rows(P, V, whole, 0.1), barrier.rows(P, V, part, 0.1)
+    selected = rows.select(np.array(kept))
+    assert (selected.ids, selected.cushion_m) == (("s/3", "s/1"), 0.1)
+    same(selected, alone, ("coefficients", "drift", "reach", "radii_m", "sigma_m", "delay_m", "least_decay"))
+    same(selected, alone, ("keep_out_m",))
+    balls = rows.balls(decay).select(np.array(kept))
+    same(balls, alone.balls(decay[kept]), ("decay", "centre", "square", "q"))
+
+
+def test_a_row_is_its_ball() -> None:
+    """g = q (|a - c|^2 - rho^2) / 2 at any acceleration and decay."""
+    config, rng = SafetyConfig(), np.random.default_rng(5)
+    rows = Barrier(config).rows(P, V, make_prediction(config), 0.0)
+    decay = np.array([0.0, 0.35, 1.0])
+    balls = rows.balls(decay)
+    assert balls.decay.tolist() == decay.tolist()
+    for a in rng.uniform(-3.0, 3.0, (5, 3)):
+        rise, psi = rows.evaluate(a)
+        away = a[:, None, None] - balls.centre
+        assert balls.q * ((away * away).sum(axis=0) - balls.square) / 2.0 == pytest.approx(
+            rise + decay[:, None] * psi, abs=1e-9
+        )
+
+
+def test_at_a_balls_centre_the_gradient_is_that_of_an_arm_of_a_millimetre() -> None:
+    config = SafetyConfig()
+    rows = Barrier(config).rows(P, V, make_prediction(config), 0.0)
+    decay = np.array([0.5, 0.5, 0.5])
+    centre = rows.balls(decay).centre[:, 1, 7]
+    gradient, norm = rows.gradient(centre, decay)
+    assert gradient[:, 1, 7] == pytest.approx(np.zeros(3), abs=1e-12)
+    assert norm[1, 7] == 1e-3 * rows.reach[9]
+
+
+@pytest.mark.parametrize(
+    ("centre", "square", "reached"),
+    [
+        ((4.0, 0.0, 0.0), (0.99,), False),  # 1 m/s^2 from the box of +-3
+        ((4.0, 0.0, 0.0), (1.01,), True),
+        ((4.0, 0.0, 0.0), (1.0,), True),  # in doubt it is reached
+        ((0.0, -5.0, 0.0), (3.99,), False),
+        ((0.0, -5.0, 0.0), (4.01,), True),
+        ((4.0, -5.0, 3.5), (5.24,), False),  # 1 + 4 + 0.25
+        ((4.0, -5.0, 3.5), (5.26,), True),
+        ((4.0, 0.0, 0.0), (0.5, 1.01), True),  # one row is enough
+        ((1.0, 1.0, 1.0), (-0.01,), False),  # holds for every acceleration
+        ((1.0, 1.0, 1.0), (0.01,), True),
+        ((1e6, 0.0, 0.0), ((1e6 - 3.0) ** 2 - 990.0,), True),  # 1e-9 of |c|^2 is the rounding
+        ((1e6, 0.0, 0.0), ((1e6 - 3.0) ** 2 - 1010.0,), False),
+    ],
+)
+def test_a_ball_is_within_reach_if_it_meets_the_box(
+    centre: tuple[float, ...], square: tuple[float, ...], reached: bool
+) -> None:
+    count, box = len(square), np.full(3, 3.0)
+    balls = Balls(
+        np.ones(1), np.tile(np.reshape(centre, (3, 1, 1)), (1, 1, count)), np.array([square]), np.ones((1, count))
+    )
+    assert balls.reachable(-box, box).tolist() == [reached]

@@ -72,3 +72,20 @@ def test_the_share_ends_on_the_surface_or_at_the_goal(cone: Cone) -> None:
 def test_from_the_surface_itself_the_way_out_has_no_share_and_the_way_in_all() -> None:
     share = norm_cone(2.0).share(np.array([2.0, 0.0, 0.0]), np.array([[3.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
     assert share.tolist() == [0.0, 1.0]
+
+
+def test_shares_by_hand() -> None:
+    assert norm_cone(0.5).share(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, -0.4, 0.0]])).tolist() == [0.5, 1.0]
+    tilt = tilt_cone(45.0)  # from hover sideways the edge is g away, and as far when sinking by half of it
+    assert tilt.share(np.zeros(3), np.array([[0.0, 2.0 * G_M_S2, 0.0]])) == pytest.approx([0.5])
+    assert tilt.share(np.zeros(3), np.array([[0.0, G_M_S2, -G_M_S2]])) == pytest.approx([0.5])
+
+
+def test_from_a_point_outside_no_way_leads_further_out() -> None:
+    share = norm_cone(2.0).share(np.array([2.1, 0.0, 0.0]), np.array([[3.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
+    assert share.tolist() == [0.0, 1.0]
+
+
+def test_a_nanometre_per_second_squared_from_the_axis_is_on_it() -> None:
+    assert norm_cone(2.0).tangent(np.array([0.0, 1e-9, 0.0]))[0].tolist() == [-1.0, 0.0, 0.0]
+    assert norm_cone(2.0).tangent(np.array([0.0, 1e-8, 0.0]))[0].tolist() == [0.0, -1.0, 0.0]

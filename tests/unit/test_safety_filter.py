@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import msgspec
@@ -10,10 +11,15 @@ import pytest
 
 from companion.config import LimitsConfig, SafetyConfig, parse_config
 from companion.errors import SolverError
+from companion.safety import filter as filter_module
 from companion.safety import qp
-from companion.safety.barrier import Barrier
-from companion.safety.filter import FilterInput, SafetyFilter
+from companion.safety.adapt import decay_interval, epsilon_star
+from companion.safety.barrier import Balls, Barrier
+from companion.safety.filter import Answer, FilterInput, SafetyFilter
+from companion.safety.limits import capability, vehicle_limits
 from companion.safety.relax import shares
+from companion.safety.stopping import StopRows, stop_rows, swerve_m
+from companion.safety.task import Found, Task, Ways
 from companion.types import FilterResult, Prediction, Verdict, frozen
 
 SAFETY = SafetyConfig(sigma_delay_s=0.0)
@@ -311,3 +317,263 @@ def test_no_solver_error_leaves_the_filter(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("companion.safety.filter.least_of_ways", broken)
     result = SafetyFilter(SAFETY, LIMITS).step(tick(straight([(1.0, 0.0, 2.0)], [(-1.0, 0.0, 0.0)])))
     assert result.verdict is Verdict.BRAKING
+
+
+def arrays_equal(one: object, other: object) -> bool:
+    """Every field of two values of the same frozen class, arrays to the bit."""
+    for field in dataclasses.fields(one):  # type: ignore[arg-type]
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if dataclasses.is_dataclass(a):
+            if not arrays_equal(a, b):
+                return False
+        elif isinstance(a, tuple) and a and dataclasses.is_dataclass(a[0]):
+            if not all(arrays_equal(x, y) for x, y in zip(a, b, strict=True)):
+                return False
+        elif not np.array_equal(a, b):
+            return False
+    return True
+
+
+def test_the_problem_is_built_of_rows_limits_target_and_stops() -> None:
+    config = msgspec.structs.replace(SAFETY, sigma_delay_s=0.02)
+    limits = LimitsConfig(slew_m_s3=10.0, norm_m_s2=2.0)
+    prediction = straight(
+        [(3.0, 0.5, 2.0), (-2.0, 0.0, 2.5)], [(-1.0, 0.0, 0.0), (-3.0, 0.2, 0.0)], sigma=0.05, radius=0.9
+    )
+    inputs = FilterInput(
+        np.array([9.0, 0.0, 2.0]),
+        np.array([1.0, 0.3, 0.1]),
+        np.array([0.5, 0.0, -0.1]),
+        prediction,
+        p_std_m=0.04,
+        accel_shrink_m_s2=0.4,
+        elapsed_s=0.02,
+        a_before=np.array([0.3, 0.1, 0.0]),
+    )
+    task = SafetyFilter(config, limits).build(inputs)
+    rows = Barrier(config).rows(inputs.p_enu, inputs.v_enu, prediction, 0.04)
+    can = capability(limits, shrink_m_s2=0.4, dt_s=0.05)
+    assert arrays_equal(task.rows, rows)
+    before = inputs.a_before
+    assert arrays_equal(
+        task.limits, vehicle_limits(inputs.p_enu, inputs.v_enu, limits, can, before=before, elapsed_s=0.02)
+    )
+    assert task.a_ref is inputs.a_ref
+    p_rel, v_rel = prediction.p_enu[:, 0] - inputs.p_enu, prediction.v_enu - inputs.v_enu
+    assert task.star == pytest.approx(epsilon_star(p_rel, v_rel, config))
+    assert task.star[1] > 0.0  # leaves to the west
+    swerve = swerve_m(can.authority_m_s2, 0.05 * math.sqrt(22.0 * 21.0), 10.0)
+    stops = stop_rows(-p_rel, -v_rel, rows.keep_out_m[:, 0], can.braking, swerve)
+    assert stops is not None
+    assert task.stops is not None
+    assert task.stops.normal == pytest.approx(stops.normal)
+    assert task.stops.floor == pytest.approx(stops.floor)
+    ready = SafetyFilter(config, limits).build(dataclasses.replace(inputs, limits_on=False))
+    assert ready.limits.arena_high.tolist() == [np.inf] * 3
+
+
+@pytest.mark.parametrize(("radius", "stops"), [(1.42, False), (1.44, True)])
+def test_what_can_be_swerved_round_within_the_horizon_has_no_stop(radius: float, stops: bool) -> None:
+    """3 m/s^2 for 0.05 s sqrt(22 * 21) = 1.075 s are 1.733 m, and D is the radius and 0.3 m."""
+    config = msgspec.structs.replace(SAFETY, kappa=0.0)
+    task = SafetyFilter(config, LIMITS).build(tick(straight([(9.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)], radius=radius)))
+    assert (task.stops is not None) == stops
+
+
+def test_the_box_shrinks_and_grows_again_with_the_disturbance() -> None:
+    guard, inputs = SafetyFilter(SAFETY, LIMITS), tick(straight([], []))
+    for shrink in (0.0, 0.5, 0.5, 0.0):
+        assert guard.build(dataclasses.replace(inputs, accel_shrink_m_s2=shrink)).limits.box_m_s2 == 3.0 - shrink
+
+
+class Search:
+    """Stands for the search: records what it is asked, and answers as given."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, a: tuple[float, ...], *, admissible: bool = True) -> None:
+        self.asked: list[tuple[Task, Balls, np.ndarray, tuple[str, ...]]] = []
+        self.violated: list[tuple[Task, np.ndarray, tuple[str, ...]]] = []
+
+        def ways(task: Task, balls: Balls, ways: Ways, order: tuple[str, ...]) -> Found:
+            self.asked.append((task, balls, ways.last, order))
+            return Found(np.array(a), np.full(len(task.rows), 0.9), admissible, 1.5, 3, "ways")
+
+        def violation(task: Task, ways: Ways, order: tuple[str, ...]) -> Found:
+            self.violated.append((task, ways.last, order))
+            return Found(np.array(a), np.full(len(task.rows), 1.1), False, np.inf, 2, "violation")
+
+        monkeypatch.setattr(filter_module, "least_of_ways", ways)
+        monkeypatch.setattr(filter_module, "least_violation", violation)
+
+
+NEAR = [(2.0, 0.05, 2.0), (2.2, -0.3, 2.0)]
+
+
+def test_the_search_has_what_is_within_reach_and_the_last_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    prediction = straight([NEAR[0], (0.0, 9.0, 2.0), NEAR[1]], [(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)])
+    ways, guard = Search(monkeypatch, (-2.0, 1.0, 0.5)), SafetyFilter(SAFETY, LIMITS)
+    inputs = tick(prediction, a=(1.0, 0.2, 0.0))
+    answer = guard.solve(guard.build(inputs), 0.05)
+    task, balls, last, order = ways.asked[0]
+    assert task.rows.ids == ("s/0", "s/2")
+    assert len(balls.decay) == 2
+    assert balls.decay.tolist() == [1.0, 1.0]
+    assert balls.centre.shape == (3, 2, 21)
+    assert last.tolist() == [1.0, 0.2, 0.0]
+    assert order == ("daqp", "osqp")
+    assert answer.verdict is Verdict.ADJUSTED
+    assert not ways.violated
+    found = answer.found
+    assert (found.admissible, found.cost, found.iterations, found.solver) == (True, 1.5, 3, "ways")
+    assert found.epsilon[[0, 2]].tolist() == [0.9, 0.9]
+    whole = guard.build(inputs)
+    lower, upper = decay_interval(whole.rows.evaluate(found.a), whole.rows.least_decay)
+    assert found.epsilon[1] == pytest.approx(float(np.clip(whole.star[1], lower[1] / 0.5, upper[1] / 0.5)))
+    assert np.array_equal(answer.values, whole.rows.evaluate(found.a))
+    guard.step(inputs)
+    guard.step(inputs)
+    assert ways.asked[-1][2].tolist() == [-2.0, 1.0, 0.5]
+    guard.reset()
+    guard.step(inputs)
+    assert ways.asked[-1][2].tolist() == [1.0, 0.2, 0.0]
+    osqp = SafetyFilter(msgspec.structs.replace(SAFETY, solver="osqp"), LIMITS)
+    osqp.step(inputs)
+    assert ways.asked[-1][3] == ("osqp", "daqp")
+
+
+def test_the_least_violation_is_asked_where_no_way_is_admissible(monkeypatch: pytest.MonkeyPatch) -> None:
+    ways = Search(monkeypatch, (-2.0, 1.0, 0.5), admissible=False)
+    guard = SafetyFilter(SAFETY, LIMITS)
+    inputs = tick(straight(NEAR, [(-1.0, 0.0, 0.0)] * 2))
+    task = guard.build(inputs)
+    answer = guard.solve(task, 0.05)
+    assert answer.found.solver == "violation"
+    reduced, last, order = ways.violated[0]
+    assert reduced is ways.asked[0][0]
+    assert reduced.rows is task.rows  # both are within reach
+    assert last.tolist() == [1.0, 0.0, 0.0]
+    assert order == ("daqp", "osqp")
+    assert answer.found.epsilon.tolist() == [1.1, 1.1]
+
+
+def test_a_vehicle_at_an_obstacle_is_sent_round_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    ways, guard = Search(monkeypatch, (0.0, 0.0, 0.0)), SafetyFilter(SAFETY, LIMITS)
+    inputs = tick(straight([(0.55, 0.0, 2.0)], [(0.0, 0.0, 0.0)]), v=(0.0, 0.0, 0.0), a=(2.0, 0.0, 0.0))
+    guard.step(inputs)
+    task, _, last, _ = ways.asked[0]
+    assert task.a_ref == pytest.approx([2.0, -2.0, 0.0])
+    assert last == pytest.approx([2.0, -2.0, 0.0])
+
+
+@pytest.mark.parametrize(("floor", "asked"), [(-5.20, []), (-5.19, ["s/1"]), (-0.5, ["s/1"])])
+def test_a_stop_that_a_corner_of_the_box_breaks_is_within_reach(
+    floor: float, asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No row of obstacles 9 m away may break; a corner of the box is sqrt(3) 3 m/s^2 = 5.196 m/s^2 out."""
+    ways, guard = Search(monkeypatch, (0.0, 0.0, 0.0)), SafetyFilter(SAFETY, LIMITS)
+    prediction = straight([(9.0, 0.0, 2.0), (0.0, 9.0, 2.0)], [(0.0, 0.0, 0.0)] * 2)
+    task = guard.build(tick(prediction, v=(0.0, 0.0, 0.0), a=(3.5, 0.0, 0.0)))
+    stops = StopRows(np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([-np.inf, floor]))
+    guard.solve(dataclasses.replace(task, stops=stops), 0.05)
+    reduced, balls, _, _ = ways.asked[0]
+    assert list(reduced.rows.ids) == asked
+    assert balls.q.shape == (len(asked), 21)
+    assert reduced.stops is not None
+    assert reduced.stops.floor.tolist() == [floor] * len(asked)
+
+
+def test_the_clf_budget_is_that_of_each_obstacles_own_history(monkeypatch: pytest.MonkeyPatch) -> None:
+    ways, guard = Search(monkeypatch, (-2.0, 1.0, 0.5)), SafetyFilter(SAFETY, LIMITS)
+    guard.step(tick(straight(NEAR[:1], [(-1.0, 0.0, 0.0)])))
+    assert ways.asked[0][0].budget.tolist() == [4.0]  # without history from the greatest epsilon, 2
+    guard.step(tick(straight(NEAR, [(-1.0, 0.0, 0.0)] * 2), elapsed_s=0.1))
+    assert ways.asked[1][0].budget == pytest.approx([0.5**2 * 0.9**2, 4.0])
+    guard.step(tick(straight(NEAR, [(-1.0, 0.0, 0.0)] * 2), elapsed_s=None))
+    assert ways.asked[2][0].budget == pytest.approx([0.9**2, 0.9**2])
+
+
+def judged(task: Task, a: tuple[float, ...], epsilon: np.ndarray, verdict: Verdict) -> FilterResult:
+    found = Found(np.array(a), epsilon, True, 0.0, 4, "given")
+    return SafetyFilter(SAFETY, LIMITS).verify(task, Answer(found, task.rows.evaluate(found.a), verdict))
+
+
+def test_the_record_names_of_each_obstacle_its_worst_row() -> None:
+    guard = SafetyFilter(SAFETY, LIMITS)
+    task = guard.build(tick(straight(NEAR, [(-1.0, 0.0, 0.0), (0.5, 0.0, 0.0)], sigma=0.02), p=(0.0, 0.0, 2.0)))
+    epsilon = np.array([1.2, 0.7])
+    result = judged(task, (-1.0, 0.5, 0.2), epsilon, Verdict.ADJUSTED)
+    assert [record.track for record in result.rows] == ["s/0", "s/1"]
+    rise, psi = task.rows.evaluate(np.array([-1.0, 0.5, 0.2]))
+    for j, record in enumerate(result.rows):
+        values = rise[j] + 0.5 * epsilon[j] * psi[j]
+        norm = np.linalg.norm(
+            [
+                task.rows.rise[axis, j]
+                + 0.5 * epsilon[j] * task.rows.psi[axis, j]
+                + a * (task.rows.rise[4, j] + 0.5 * epsilon[j] * task.rows.psi[4, j])
+                for axis, a in ((1, -1.0), (2, 0.5), (3, 0.2))
+            ],
+            axis=0,
+        )
+        step = int((values / norm).argmin())
+        assert record.step == step
+        assert record.slack == pytest.approx(float((values / norm)[step]))
+        assert record.margin == task.rows.margins(np.array([step, step]))[j]
+        assert (record.epsilon, record.epsilon_star) == (epsilon[j], task.star[j])
+    assert (result.iterations, result.solver) == (4, "given")
+    assert result.worst == min(result.rows, key=lambda record: record.slack)
+
+
+@pytest.mark.parametrize(
+    ("beyond", "verdict", "expected"),
+    [
+        (5e-7, Verdict.ADJUSTED, Verdict.ADJUSTED),  # within the tolerance of 1e-6
+        (2e-6, Verdict.ADJUSTED, Verdict.RELAXED),
+        (2e-6, Verdict.BRAKING, Verdict.BRAKING),
+        (2e-6, Verdict.NOMINAL, Verdict.NOMINAL),
+    ],
+)
+def test_a_broken_limit_relaxes_an_adjusted_answer(beyond: float, verdict: Verdict, expected: Verdict) -> None:
+    """At 5.9 m/s no more than 2 m/s^2 ahead."""
+    task = SafetyFilter(SAFETY, LIMITS).build(tick(straight([], []), v=(5.9, 0.0, 0.0), p=(-9.0, 0.0, 5.0)))
+    result = judged(task, (2.0 + beyond, 0.0, 0.0), np.zeros(0), verdict)
+    assert result.verdict is expected
+    assert result.worst is not None
+    assert (result.worst.track, result.worst.step, result.worst.margin) == ("speed", -1, None)
+    assert (result.worst.epsilon, result.worst.epsilon_star) == (0.0, 0.0)
+    assert result.worst.slack == pytest.approx(-beyond, rel=1e-3)
+
+
+@pytest.mark.parametrize(("room", "listed"), [(0.049, True), (0.051, False)])
+def test_a_limit_is_listed_where_little_room_is_left(room: float, listed: bool) -> None:
+    task = SafetyFilter(SAFETY, LIMITS).build(tick(straight([], []), v=(5.9, 0.0, 0.0), p=(-9.0, 0.0, 5.0)))
+    result = judged(task, (2.0 - room, 0.0, 0.0), np.zeros(0), Verdict.ADJUSTED)
+    assert [record.track for record in result.rows] == (["speed"] if listed else [])
+    assert (result.worst is None) != listed
+
+
+@pytest.mark.parametrize(("room", "listed"), [(0.049, True), (0.051, False)])
+def test_a_stop_is_listed_where_little_room_is_left(room: float, listed: bool) -> None:
+    task = SafetyFilter(SAFETY, LIMITS).build(tick(straight([(9.0, 0.0, 2.0), (0.0, 9.0, 2.0)], [(0.0, 0.0, 0.0)] * 2)))
+    stops = StopRows(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]), np.array([-np.inf, -1.0]))
+    task = dataclasses.replace(task, stops=stops, star=np.array([0.3, 0.4]))
+    result = judged(task, (1.0 - room, 0.0, 0.0), np.array([0.5, 0.6]), Verdict.ADJUSTED)
+    records = [record for record in result.rows if record.step == -1]
+    assert len(result.rows) == 2 + len(records)
+    assert len(records) == listed
+    for record in records:
+        assert (record.track, record.epsilon, record.epsilon_star) == ("s/1", 0.6, 0.4)
+        assert record.slack == pytest.approx(room)
+        assert record.margin == task.rows.margins(np.array([0, 0]))[1]
+
+
+def test_a_reference_at_the_very_stop_passes() -> None:
+    guard = SafetyFilter(SAFETY, LIMITS)
+    task = guard.build(tick(straight([(9.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)]), v=(0.0, 0.0, 0.0), a=(1.0, 0.0, 0.0)))
+    for floor, verdict in ((-1.0, Verdict.NOMINAL), (-0.999, Verdict.ADJUSTED)):
+        stops = StopRows(np.array([[-1.0, 0.0, 0.0]]), np.array([floor]))
+        answer = guard.solve(dataclasses.replace(task, stops=stops), 0.05)
+        assert answer.verdict is verdict
+    assert answer.found.a[0] <= 0.999 + 1e-6
+    nominal = guard.solve(task, 0.05)
+    assert (nominal.found.admissible, nominal.found.cost, nominal.found.iterations) == (True, 0.0, 0)
+    assert nominal.found.solver == "none"

@@ -190,3 +190,94 @@ def test_a_limit_tightened_below_the_last_setpoint_has_a_point_inside() -> None:
     )
     assert np.linalg.norm(limits.clip(np.array([[3.0, 3.0, 3.0]]))[0]) <= 1.0 + 1e-9
     assert set(limits.slacks(np.zeros(3))) == {"arena", "floor", "ceiling", "speed", "norm"}
+
+
+@pytest.mark.parametrize(
+    ("p", "a", "name"),
+    [
+        ((9.0, 0.0, 5.0), (1.0, 0.0, 0.0), "arena"),
+        ((-9.0, 0.0, 5.0), (-1.0, 0.0, 0.0), "arena"),
+        ((0.0, 9.0, 5.0), (0.0, 1.0, 0.0), "arena"),
+        ((0.0, -9.0, 5.0), (0.0, -1.0, 0.0), "arena"),
+        ((0.0, 0.0, 9.0), (0.0, 0.0, 1.0), "ceiling"),
+        ((0.0, 0.0, 1.3), (0.0, 0.0, -1.0), "floor"),
+    ],
+)
+def test_every_wall_has_its_slack(p: tuple[float, ...], a: tuple[float, ...], name: str) -> None:
+    """A metre away at rest: the speed that stops within it, reached in one step, less what is asked."""
+    limits = at(p, (0.0, 0.0, 0.0))
+    free = Braking(BRAKING_SHARE * 3.0, 0.05).speed(1.0) / 0.05
+    slacks = limits.slacks(np.array(a))
+    assert slacks[name] == pytest.approx(free - 1.0)
+    assert all(slacks[other] > slacks[name] + 1.0 for other in {"arena", "floor", "ceiling"} - {name})
+    fast = at(p, tuple(2.0 * component for component in a))
+    into = np.array([3.0, 3.0, 3.0]) * a
+    assert np.abs(fast.clip(into[None])[0]).max() < 3.0
+    assert fast.clip_hard(into[None])[0].tolist() == into.tolist()
+    assert not fast.admits(into)
+    assert fast.admits(fast.clip(into[None])[0])
+
+
+def test_what_the_limits_are_made_of() -> None:
+    limits = at((0.0, 0.0, 5.0), (1.0, 2.0, 3.0), shrink=1.0)
+    assert limits.box_m_s2 == 2.0
+    assert limits.v_enu.tolist() == [1.0, 2.0, 3.0]
+    assert limits.inside.tolist() == [0.0, 0.0, 0.0]
+    assert limits.hard_low.tolist() == [-2.0, -2.0, -2.0]
+    assert limits.hard_high.tolist() == [2.0, 2.0, 2.0]
+    free = at((0.0, 0.0, 5.0), (1.0, 2.0, 3.0), arena_on=False)
+    assert free.arena_low.tolist() == [-np.inf] * 3
+    assert free.arena_high.tolist() == [np.inf] * 3
+    can = capability(LimitsConfig(slew_m_s3=7.0), shrink_m_s2=4.0, dt_s=0.02)
+    assert (can.box_m_s2, can.authority_m_s2) == (0.0, 0.0)
+    assert (can.braking.a_m_s2, can.braking.dt_s, can.braking.slew_m_s3) == (0.0, 0.02, 7.0)
+
+
+def test_what_another_rounds_otherwise_is_admitted() -> None:
+    nothing = at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), shrink=3.0)
+    assert nothing.admits(np.array([1e-9, 0.0, -1e-9]))
+    assert not nothing.admits(np.array([2e-9, 0.0, 0.0]))
+    assert not nothing.admits(np.array([0.0, 0.0, -2e-9]))
+
+
+def test_exactly_at_the_speed_limit_is_admitted() -> None:
+    can = capability(LIMITS, shrink_m_s2=0.0, dt_s=0.5)
+    limits = vehicle_limits(np.array([0.0, 0.0, 5.0]), np.array([5.0, 0.0, 0.0]), LIMITS, can, arena_on=False)
+    assert limits.may_speed
+    assert limits.admits(np.array([2.0, 0.0, 0.0]))
+    assert not limits.admits(np.array([2.001, 0.0, 0.0]))
+
+
+def test_norm_and_tilt_are_admitted_and_clipped_to() -> None:
+    config = LimitsConfig(norm_m_s2=2.0, tilt_deg=10.0)
+    can = capability(config, shrink_m_s2=0.0, dt_s=0.05)
+    limits = vehicle_limits(np.array([0.0, 0.0, 5.0]), np.zeros(3), config, can)
+    assert limits.admits(np.array([0.0, 0.0, 2.0]))
+    assert not limits.admits(np.array([0.0, 0.0, 2.01]))
+    side = 9.80665 * np.tan(np.radians(10.0))  # 1.729
+    assert limits.admits(np.array([0.0, side - 1e-6, 0.0]))
+    assert not limits.admits(np.array([0.0, side + 1e-6, 0.0]))
+    clipped = limits.clip(np.array([[0.0, 0.0, 3.0], [3.0, 0.0, 0.0], [0.5, 0.5, 0.5]]))
+    assert clipped == pytest.approx(np.array([[0.0, 0.0, 2.0], [side, 0.0, 0.0], [0.5, 0.5, 0.5]]))
+    assert limits.slacks(np.array([0.0, 0.0, 0.5]))["norm"] == pytest.approx(1.5)
+    assert limits.slacks(np.zeros(3))["tilt"] == pytest.approx(side * np.cos(np.radians(10.0)))
+
+
+def test_cones_are_clipped_to_along_the_way_from_the_last_setpoint() -> None:
+    """From (0, 1.2, 0) towards (0.5, 1.7, 0), the corner that slew leaves: |a| = 1.5 after a share s of the way.
+
+    0.5 s^2 + 1.2 s + 1.44 = 2.25, so s = -1.2 + sqrt(1.44 + 1.62).
+    """
+    config = LimitsConfig(norm_m_s2=1.5, slew_m_s3=10.0)
+    can = capability(config, shrink_m_s2=0.0, dt_s=0.05)
+    before = np.array([0.0, 1.2, 0.0])
+    limits = vehicle_limits(np.array([0.0, 0.0, 5.0]), np.zeros(3), config, can, before=before)
+    share = -1.2 + np.sqrt(3.06)
+    expected = before + share * np.array([0.5, 0.5, 0.0])
+    assert limits.clip(np.array([[3.0, 3.0, 0.0]]))[0] == pytest.approx(expected)
+
+
+def test_a_position_and_a_velocity_have_as_many_components() -> None:
+    can = capability(LIMITS, shrink_m_s2=0.0, dt_s=0.05)
+    with pytest.raises(ValueError, match="shorter"):
+        vehicle_limits(np.array([0.0, 0.0, 5.0]), np.zeros(2), LIMITS, can)

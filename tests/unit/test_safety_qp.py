@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -57,7 +59,7 @@ def test_solvers_agree_on_random_programs(seed: int) -> None:
 
 @pytest.mark.parametrize("name", ["daqp", "osqp"])
 def test_an_infeasible_program_is_named_so(name: str) -> None:
-    with pytest.raises(Infeasible, match="2 variables, 2 rows"):
+    with pytest.raises(Infeasible, match=r"^infeasible: 2 variables, 2 rows$"):
         solve(program([[1.0, 0.0], [-1.0, 0.0]], [1.0, 1.0]), (name,))
 
 
@@ -81,10 +83,57 @@ def test_the_other_solver_takes_over(monkeypatch: pytest.MonkeyPatch, wrong: np.
 def test_both_failing_is_a_solver_error(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("daqp", "osqp"):
         monkeypatch.setitem(qp.BACKENDS, name, lambda _: None)
-    with pytest.raises(SolverError, match="no answer from daqp, osqp: 2 variables, 0 rows"):
+    with pytest.raises(SolverError, match=r"^no answer from daqp, osqp: 2 variables, 0 rows$"):
         solve(program([], []), ("daqp", "osqp"))
 
 
 def test_a_solver_cut_short_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(qp.daqp, "solve", lambda *_, **__: (np.zeros(2), 0.0, -4, {}))
     assert solve_daqp(program([], [])) is None
+
+
+def test_daqp_answers_to_a_billionth() -> None:
+    """2 x <= -1 and 3 y >= 4 in a program whose minimum lies elsewhere."""
+    problem = program([[-2.0, 0.0], [0.0, 3.0]], [1.0, 4.0])
+    x = solve_daqp(problem)
+    assert x is not None
+    assert x == pytest.approx((-0.5, 4.0 / 3.0), abs=1e-9)
+    assert x.dtype == np.float64
+
+
+def test_an_answer_may_break_its_rows_by_the_solvers_tolerance_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = program([[-1.0, 0.0]], [0.5])
+    monkeypatch.setitem(qp.BACKENDS, "daqp", lambda _: np.array([-0.5 + 9e-6, 1.0]))
+    assert solve(problem, ("daqp", "osqp"))[1] == "daqp"
+    monkeypatch.setitem(qp.BACKENDS, "daqp", lambda _: np.array([-0.5 + 2e-5, 1.0]))
+    assert solve(problem, ("daqp", "osqp"))[1] == "osqp"
+    monkeypatch.setitem(qp.BACKENDS, "daqp", lambda _: np.array([np.inf, 1.0]))
+    assert solve(problem, ("daqp", "osqp"))[1] == "osqp"
+
+
+def test_osqp_is_polished_and_silent(capfd: pytest.CaptureFixture[str]) -> None:
+    x = solve_osqp(program([[-2.0, 0.0], [0.0, 3.0]], [1.0, 4.0]))
+    assert x is not None
+    assert x == pytest.approx((-0.5, 4.0 / 3.0), abs=1e-8)  # without polishing the tolerance of 1e-6
+    assert capfd.readouterr().out == ""
+
+
+def test_what_a_solver_names_otherwise_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped = SimpleNamespace(info=SimpleNamespace(status="maximum iterations reached"), x=np.zeros(2))
+    monkeypatch.setattr(qp.osqp.OSQP, "solve", lambda *_, **__: stopped)
+    assert solve_osqp(program([], [])) is None
+
+
+def test_osqp_is_pinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its penalty changes by iterations, not by time, or answers would depend on the load of the machine."""
+    real, given = qp.osqp.OSQP.setup, {}
+
+    def setup(*arguments: object, **settings: object) -> None:
+        given.update(settings)
+        real(*arguments, **settings)
+
+    monkeypatch.setattr(qp.osqp.OSQP, "setup", setup)
+    solve_osqp(program([], []))
+    assert given["adaptive_rho_interval"] == 25
+    assert given["max_iter"] == 4000
+    assert (given["eps_abs"], given["eps_rel"]) == (1e-6, 1e-6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import msgspec
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
 from companion.safety import qp, relax
+from companion.safety.adapt import decay_interval
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.safety.relax import braking, by_contact, least_violation, shares, widest
 from companion.safety.task import Task, Ways
@@ -169,3 +172,236 @@ def test_braking_takes_the_admissible_then_the_widest_then_the_slowest() -> None
     assert shares(tight.rows, found.a[None])[0, 0] >= offered.max() - 0.3
     assert (found.epsilon >= 0.0).all()
     assert (found.epsilon <= 2.0).all()
+
+
+def test_without_any_margin_a_share_is_of_a_millimetre() -> None:
+    config = msgspec.structs.replace(SAFETY, cushion_m=0.0)
+    task = task_of(inputs_of([(0.4005, 0.0, 0.0)], [(0.0, 0.0, 0.0)], speed=(0.0, 0.0, 0.0)), config=config)
+    assert shares(task.rows, np.zeros((1, 3)))[0, 0] == pytest.approx(0.5)
+
+
+def test_contacts_of_one_step_come_in_the_order_of_their_depth() -> None:
+    """Both are inside at the first step; and of two that never come within D, the nearer pass counts at one instant."""
+    rows = task_of(inputs_of([(0.4, 0.0, 0.0), (0.3, 0.0, 0.0)], [(3.0, 0.0, 0.0)] * 2)).rows
+    assert by_contact(rows).tolist() == [1, 0]
+    rows = task_of(inputs_of([(1.0, 1.2, 0.0), (1.0, -1.0, 0.0)], [(0.0, 0.0, 0.0)] * 2)).rows
+    assert by_contact(rows).tolist() == [1, 0]
+
+
+SLEWED = LimitsConfig(slew_m_s3=20.0, norm_m_s2=2.0, tilt_deg=8.0, speed_m_s=3.2)
+
+
+def hand_program(task: Task, a: np.ndarray, kept: np.ndarray, raised: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows over (a, t, t at the end, stop, arena, speed), one loop after another."""
+    rows, floors = [], []
+
+    def add(normal: np.ndarray, floor: float, *others: tuple[int, float]) -> None:
+        row = np.zeros(8)
+        row[:3] = normal
+        for column, coefficient in others:
+            row[column] = coefficient
+        rows.append(row)
+        floors.append(floor)
+
+    for cone in task.limits.cones:  # kept
+        add(*cone.tangent(a))
+    add(*task.limits.speed.tangent(a), (7, 1.0))
+    assert task.stops is not None
+    for normal, floor in zip(task.stops.normal, task.stops.floor, strict=True):
+        if np.isfinite(floor):
+            add(normal, floor, (5, 1.0))
+    for axis in range(3):
+        add(np.eye(3)[axis], task.limits.arena_low[axis], (6, 1.0))
+    for axis in range(3):
+        add(-np.eye(3)[axis], -task.limits.arena_high[axis], (6, 1.0))
+    barrier, last = task.rows, task.rows.keep_out_m.shape[1] - 1
+
+    def tangent(j: int, i: int) -> tuple[np.ndarray, float, float]:
+        """|r| >= d + s n . (x - a); what that leaves of R, and the margin."""
+        reach = barrier.reach[i + 2]
+        r = barrier.drift[:, j, i + 2] + reach * a
+        d = float(np.linalg.norm(r))
+        margin = barrier.keep_out_m[j, i] - barrier.radii_m[j]
+        return reach * r / d, float(reach * (r @ a) / d) - d + float(barrier.radii_m[j]), float(margin)
+
+    for j in range(len(barrier)):
+        for i in range(last + 1):
+            normal, floor, margin = tangent(j, i)
+            add(normal, floor + kept[j, 0] * margin)
+    for j in range(len(barrier)):
+        normal, floor, margin = tangent(j, last)
+        add(normal, floor + max(kept[j, 1], -1e3) * margin)
+    for j in raised:
+        for i in range(last + 1):
+            normal, floor, margin = tangent(j, i)
+            add(normal, floor, (3, -margin))
+    for j in raised:
+        normal, floor, margin = tangent(j, last)
+        add(normal, floor, (4, -margin))
+    return np.array(rows), np.array(floors)
+
+
+def crowded() -> Task:
+    """Three small obstacles and one too large to swerve round, with every limit in the way."""
+    inputs = inputs_of(
+        [(1.6, 0.2, 0.1), (2.0, -0.5, 0.0), (1.2, 0.4, -0.6)],
+        [(-1.0, 0.0, 0.0), (-0.5, 0.3, 0.0), (-0.4, -0.6, 0.2)],
+        speed=(2.9, 0.2, -0.1),
+        a_ref=(0.5, -0.3, 0.2),
+        before=(0.4, 0.1, 0.0),
+    )
+    prediction = dataclasses.replace(inputs.prediction, radius_m=frozen([0.2, 0.3, 2.5]))
+    return task_of(dataclasses.replace(inputs, prediction=prediction), SLEWED)
+
+
+@pytest.mark.parametrize("raised", [[1], [2, 0]])
+def test_a_program_of_shares_by_hand(raised: list[int]) -> None:
+    task, a = crowded(), np.array([0.3, -0.2, 0.4])
+    assert [cone.name for cone in task.limits.cones] == ["norm", "tilt"]
+    assert task.limits.may_speed
+    assert task.stops is not None
+    assert np.isfinite(task.stops.floor).tolist() == [False, False, True]
+    kept = np.array([[0.25, -np.inf], [-0.1, 0.4], [-0.3, -np.inf]])
+    program = relax._share_program(task, a, kept, np.array(raised))
+    rows, floors = hand_program(task, a, kept, raised)
+    assert program.rows == pytest.approx(rows)
+    assert program.floor == pytest.approx(floors)
+    assert program.weight.tolist() == [2.0] * 8
+    assert program.linear.tolist() == [-1.0, 0.6, -0.4, -1e6, -1e4, 3e3, 1e3, 1e2]
+    assert program.low.tolist() == [*task.limits.hard_low, -qp.UNBOUNDED, -qp.UNBOUNDED, 0.0, 0.0, 0.0]
+    assert program.high.tolist() == [*task.limits.hard_high, 1.0, 1.0, *[qp.UNBOUNDED] * 3]
+
+
+def test_without_an_arena_a_program_has_no_infinite_floor() -> None:
+    inputs = dataclasses.replace(inputs_of([(1.2, 0.1, 0.0)], [(-2.0, 0.0, 0.0)]), limits_on=False)
+    task = task_of(inputs)
+    program = relax._share_program(task, np.zeros(3), np.full((1, 2), -np.inf), np.array([0]))
+    assert program.floor[:6].tolist() == [-qp.UNBOUNDED] * 6
+    assert np.isfinite(program.floor).all()
+
+
+def test_on_top_of_an_obstacle_a_program_is_finite() -> None:
+    task = task_of(inputs_of([(0.0, 0.0, 0.0)], [(3.0, 0.0, 0.0)]))
+    program = relax._share_program(task, np.zeros(3), np.zeros((1, 2)), np.array([0]))
+    assert np.isfinite(program.rows).all()
+    assert np.isfinite(program.floor).all()
+
+
+class Programs:
+    """Records what each program is asked, and answers as given: accelerations, shares, shares at the end."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, answers: list[tuple[float, ...]]) -> None:
+        self.asked: list[tuple[np.ndarray, np.ndarray, list[int]]] = []
+        given = iter(answers)
+
+        def program(_: Task, a: np.ndarray, kept: np.ndarray, raised: np.ndarray) -> None:
+            self.asked.append((a.copy(), kept.copy(), raised.tolist()))
+
+        monkeypatch.setattr(relax, "_share_program", program)
+        monkeypatch.setattr(relax, "solve", lambda *_: (np.array([*next(given), 0.0, 0.0, 0.0]), "given"))
+
+
+def three() -> Task:
+    """Contacts with 1, with 0, then with 2."""
+    return task_of(inputs_of([(2.0, 0.1, 0.0), (1.4, 0.0, 0.0), (2.9, 0.0, 0.0)], [(-0.5, 0.0, 0.0)] * 3))
+
+
+def test_obstacles_are_raised_one_after_the_other_and_the_last_repeatedly(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = three()
+    assert by_contact(task.rows).tolist() == [1, 0, 2]
+    programs = Programs(
+        monkeypatch,
+        [
+            (-1.0, 9.0, 0.0, 0.7, 0.9),
+            (-1.0, 2.0, 0.0, 0.4, 0.6),
+            (-1.5, 2.0, 0.0, 0.2, 0.3),
+            (-1.5, 2.0, 1e-2, 0.2, 0.3),
+        ],
+    )
+    found = least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
+    assert [raised for _, _, raised in programs.asked] == [[1], [0], [2], [2]]
+    start = programs.asked[0][0]
+    first = np.minimum(shares(task.rows, start[None])[0], 0.0) - 1e-6
+    end = [-np.inf] * 3
+    for (a, kept, _), moved, low, late in zip(
+        programs.asked,
+        (start, [-1.0, 3.0, 0.0], [-1.0, 2.0, 0.0], [-1.5, 2.0, 0.0]),
+        (first, [first[0], 0.7 - 1e-6, first[2]], *([[0.4 - 1e-6, 0.7 - 1e-6, first[2]]] * 2)),
+        (end, [-np.inf, 0.9 - 1e-6, -np.inf], *([[0.6 - 1e-6, 0.9 - 1e-6, -np.inf]] * 2)),
+        strict=True,
+    ):
+        assert a.tolist() == pytest.approx(list(moved))
+        assert kept[:, 0].tolist() == pytest.approx(list(low), abs=1e-12)
+        assert kept[:, 1].tolist() == pytest.approx(list(late), abs=1e-12)
+    assert found.a.tolist() == [-1.5, 2.0, 1e-2]
+    assert (found.admissible, found.cost, found.iterations, found.solver) == (False, np.inf, 4, "given")
+    lower, upper = decay_interval(task.rows.evaluate(found.a), task.rows.least_decay)
+    assert found.epsilon == pytest.approx(np.clip((lower + upper) / 2.0, 0.0, 1.0) / 0.5)
+
+
+def test_the_last_obstacles_are_repeated_until_the_answer_settles(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = msgspec.structs.replace(SAFETY, iterations=6)
+    task = task_of(inputs_of([(1.4, 0.0, 0.0), (2.0, 0.1, 0.0)], [(-0.5, 0.0, 0.0)] * 2), config=config)
+    same = (-1.0, 2.0, 0.0, 0.5, 0.5)
+    programs = Programs(monkeypatch, [same, same, (-1.0, 2.0, 0.002, 0.5, 0.5), (-1.0, 2.0, 0.0025, 0.5, 0.5)])
+    found = least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
+    # the second answer equals the first, and no more is asked: it was the last group's
+    assert [raised for _, _, raised in programs.asked] == [[0], [1]]
+    assert found.iterations == 2
+    programs = Programs(
+        monkeypatch, [same, (-1.0, 2.0, 0.002, 0.5, 0.5), (-1.0, 2.0, 0.0025, 0.5, 0.5), (0.0, 0.0, 0.0, 0.0, 0.0)]
+    )
+    found = least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
+    assert [raised for _, _, raised in programs.asked] == [[0], [1], [1]]
+    assert found.a.tolist() == [-1.0, 2.0, 0.0025]
+
+
+@pytest.mark.parametrize(
+    ("iterations", "groups"),
+    [(1, [[1, 0, 2]]), (2, [[1], [0, 2]]), (3, [[1], [0, 2], [0, 2]]), (4, [[1], [0], [2], [2]])],
+)
+def test_half_of_the_programs_are_for_one_obstacle_each(
+    iterations: int, groups: list[list[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = msgspec.structs.replace(SAFETY, iterations=iterations)
+    task = dataclasses.replace(three(), config=config)
+    programs = Programs(monkeypatch, [(0.1 * count, 0.0, 0.0, 0.5, 0.5) for count in range(9)])
+    least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
+    assert [raised for _, _, raised in programs.asked] == groups
+
+
+def test_it_starts_from_the_widest_way_and_from_the_last_one_unless_another_is_wider(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Straight at a sphere a metre away: the best corner leaves a share of -0.24, 3 % less of it -0.35."""
+    task = task_of(inputs_of([(1.2, 0.02, 0.0)], [(0.0, 0.0, 0.0)]))
+    best = np.array([-3.0, -3.0, 3.0])
+    assert shares(task.rows, best[None])[0, 0] == pytest.approx(-0.2437, abs=1e-4)
+    for last, start in (
+        (np.zeros(3), best),
+        (0.97 * best, 0.97 * best),  # worse by less than 0.15: kept
+        (0.93 * best, best),
+        (9.0 * best, best),  # clipped to what the vehicle can do
+    ):
+        programs = Programs(monkeypatch, [(0.0, 0.0, 0.0, 0.5, 0.5)] * 9)
+        least_violation(task, Ways(task, last), ("daqp",))
+        assert np.abs(programs.asked[0][0]) == pytest.approx(np.abs(start))
+        assert programs.asked[0][1][0, 0] == pytest.approx(shares(task.rows, start[None])[0, 0] - 1e-6, abs=1e-12)
+
+
+def test_braking_takes_what_is_admissible_before_what_is_wide() -> None:
+    """The epsilon is the target where that is admissible, else the least; and the stop takes no longer than a step."""
+    task = task_of(inputs_of([(4.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)], speed=(1.0, 0.0, 0.0)))
+    found = braking(task, Ways(task, np.zeros(3)))
+    assert found.a == pytest.approx([-3.0, 0.0, 0.0])
+    lower, _ = decay_interval(task.rows.evaluate(found.a), task.rows.least_decay)
+    assert found.epsilon == pytest.approx(np.clip(np.maximum(task.star, lower / 0.5), 0.0, 2.0))
+    assert (found.cost, found.iterations, found.solver) == (np.inf, 0, "none")
+    moving = task_of(inputs_of([], [], speed=(0.03, -0.04, 0.0)))
+    assert braking(moving, Ways(moving, np.zeros(3))).a == pytest.approx([-0.6, 0.8, 0.0])
+    quick = task_of(inputs_of([], [], speed=(3.0, -4.0, 0.0), at=(0.0, 0.0, 5.0)))
+    assert braking(quick, Ways(quick, np.zeros(3))).a == pytest.approx(
+        [-3.0, 3.0, 0.0]
+    )  # slower after it than straight braking
+    resting = task_of(inputs_of([], [], speed=(0.0, 0.0, 0.0)))
+    assert braking(resting, Ways(resting, np.array([1.0, 0.0, 0.0]))).a.tolist() == [0.0, 0.0, 0.0]

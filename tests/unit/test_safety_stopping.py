@@ -169,3 +169,53 @@ def test_the_paper_has_no_braking_rows() -> None:
         FilterInput(np.zeros(3), np.zeros(3), np.zeros(3), prediction_of(np.full((1, 3), 9.0), np.zeros((1, 3)), 6.0))
     )
     assert task.stops is None
+
+
+def test_stopping_distances_by_hand() -> None:
+    """On a grid of 0.5 s with 6 m/s^3 and 6 m/s^2, and without a slew limit with 2 m/s^2 on one of 0.05 s."""
+    slewed = Braking(6.0, 0.5, 6.0)
+    assert slewed.stop_m(0.0, 0.75) == pytest.approx(0.25)  # after 0.5 s: 0.75 * 0.5 - 0.5^3
+    assert slewed.stop_m(2.0, -1.0) == pytest.approx(4.0 / 27.0)  # from rest at 2 m/s^2, after 2/3 s
+    assert slewed.stop_m(-6.0, 9.0) == pytest.approx(36.0 / 12.0 + 0.25 * 6.0)  # 6 m/s and all of the brakes on
+    free = Braking(2.0, 0.05)
+    assert free.stop_m(1.0, 3.0) == pytest.approx(3.05**2 / 4.0 + 3.05 * 0.025)
+    assert free.stop_m(-1.0, 0.0) == 0.0
+    assert free.stop_m(0.0, 0.0) == 0.0
+
+
+def test_on_the_way_back_from_past_a_wall_slew_does_not_forbid_to_slow_down() -> None:
+    """Half a metre past it at 1 m/s back, where 0.5 m/s is asked: (1 - 0.5) / 0.05 s."""
+    assert Braking(2.0, DT, 5.0).bound(-0.55, -1.0) == pytest.approx(10.0)
+
+
+def test_at_the_wall_itself_slew_counts() -> None:
+    """0.5 m/s back on a grid of 0.5 s: 1 m/s^2 would rest at the wall, but then go on through it."""
+    braking = Braking(2.0, 0.5, 5.0)
+    bound = braking.bound(-0.25, -0.5)
+    assert 0.5 < bound < 1.0
+    assert braking.stop_m(bound, -0.5) <= 0.0 < braking.stop_m(bound + 1e-3, -0.5)
+
+
+def test_with_a_quick_slew_the_bound_is_exact_up_to_ten_times_the_brakes_and_free_beyond() -> None:
+    braking = Braking(2.0, DT, 200.0)
+    bound = braking.bound(0.5, -0.2)
+    assert 16.0 < bound < 16.2
+    assert braking.stop_m(bound, -0.2) <= 0.51 < braking.stop_m(bound + 1e-3, -0.2)
+    assert braking.stop_m(20.0, -0.5) < 1.025 < braking.stop_m(22.0, -0.5)
+    assert braking.bound(1.0, -0.5) == (braking.speed(1.025) + 0.5) / DT
+
+
+def test_what_can_just_be_swerved_round_has_no_row() -> None:
+    braking = Braking(2.0, DT)
+    assert stop_rows(np.array([[-9.0, 0.0, 0.0]]), np.zeros((1, 3)), np.array([1.5]), braking, 1.5) is None
+    near = stop_rows(np.array([[0.0, 0.0, 0.25]]), np.zeros((1, 3)), np.array([2.0]), braking, 1.5)
+    assert near is not None
+    assert near.normal.tolist() == [[0.0, 0.0, 1.0]]
+    assert near.floor.tolist() == [-braking.bound(-1.75, 0.0)]
+
+
+def test_a_selection_of_rows_keeps_normals_and_floors_together() -> None:
+    rows = StopRows(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.array([1.0, 2.0, 3.0]))
+    selected = rows.select(np.array([2, 0]))
+    assert selected.normal.tolist() == [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    assert selected.floor.tolist() == [3.0, 1.0]
