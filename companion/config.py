@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from companion.config_check import check_arena, check_confirmation, check_tick, pointed
+from companion.config_check import check_arena, check_confirmation, check_reserve, check_tick, pointed
 from companion.errors import ConfigError
 from companion.profiles import PROFILES, Profile
 
@@ -131,7 +131,8 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     lambda_delta: Positive = 0.01
     drone_radius_m: Positive = 0.2
     cushion_m: NonNegative = 0.1
-    kappa: NonNegative = 2.2
+    kappa: NonNegative = 1.5
+    kappa_now: NonNegative = 2.5  # of the present sigma, on top: every tick has that error, a prediction is corrected
     sigma_growth_s: NonNegative = 0.7  # predicted sigma counts up to this far ahead; the next looks correct the rest
     sigma_cap_m: Positive = 2.0  # kappa sigma counts no further than this: a track just born is no wall
     sigma_delay_s: NonNegative = 0.01
@@ -214,6 +215,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "braking": False,
             "horizon": 5,
             "kappa": 0.0,
+            "kappa_now": 0.0,
             "sigma_delay_s": 0.0,
             "recovery": 0.0,
             "lambda_epsilon": 10.0,
@@ -254,6 +256,8 @@ def parse_config(raw: Mapping[str, Any], *, source: str = "configuration") -> Co
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {pointed(str(error))}") from None
     check_tick(config.rate_hz, source)
+    if config.disturbance.enabled:
+        check_reserve(config.limits.acceleration_m_s2, config.disturbance.bound_m_s2, source)
     check_confirmation(config.tracking.confirm_hits, config.tracking.confirm_frames, source)
     check_arena(config.limits.arena_min, config.limits.arena_max, config.target.position, source)
     if config.sync == "none" and config.lockstep_sources:

@@ -43,3 +43,12 @@ def check_confirmation(hits: int, frames: int, source: str) -> None:
         raise ConfigError(
             f"{source}: tracking.confirm_hits: expected at most confirm_frames + 1 = {frames + 1}, got {hits}"
         )
+
+
+def check_reserve(acceleration_m_s2: float, bound_m_s2: float, source: str) -> None:
+    """Raise ConfigError where the disturbance estimate may take all that the vehicle has."""
+    if acceleration_m_s2 <= bound_m_s2:
+        raise ConfigError(
+            f"{source}: limits.acceleration_m_s2: expected more than disturbance.bound_m_s2 = {bound_m_s2}, "
+            f"got {acceleration_m_s2}"
+        )

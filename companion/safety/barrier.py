@@ -218,12 +218,18 @@ class Barrier:
         )
 
     def _sigma(self, prediction: Prediction, p_std_m: float) -> FloatArray:
-        """kappa sigma of every row, (M, R) [m]: computed where it differs, then spread over the rows."""
+        """The noise part of D of every row, (M, R) [m]: computed where it differs, then spread over the rows.
+
+        min(kappa sigma_k, cap) + kappa_now sigma_2. The error of now is in every tick's picture, and a vehicle that
+        passes as near as D allows meets its largest value: it counts more often than what a later look will correct.
+        """
+        config = self._config
         sigma = prediction.sigma_m[:, self._sigma_from : self._sigma_to + 1]
         sigma = np.sqrt(sigma * sigma + p_std_m * p_std_m)
-        sigma *= self._config.kappa
-        np.minimum(sigma, self._config.sigma_cap_m, out=sigma)
-        return np.asarray(sigma.take(self._sigma_at, axis=1))
+        part = config.kappa * sigma
+        np.minimum(part, config.sigma_cap_m, out=part)
+        part += np.minimum(config.kappa_now * sigma[:, :1], config.sigma_cap_m)
+        return np.asarray(part.take(self._sigma_at, axis=1))
 
     def _coefficients(self, drift: FloatArray, keep_out: FloatArray) -> FloatArray:
         """(5, 2, M, R) from c_k (3, M, K): |r_k|^2 / 2 over the monomials, decayed to psi, stepped to rise."""

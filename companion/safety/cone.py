@@ -9,7 +9,7 @@ cone, so an answer to a program with tangents is judged by the cone itself, and 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,16 @@ class Cone:
         x = self._arm(a)
         over = np.sqrt(np.vecdot(x, x)) - self.slope * a[..., 2] - self.radius
         return np.asarray(over / math.hypot(1.0, self.slope))
+
+    @property
+    def reach(self) -> float:
+        """Length of the shortest way out of a cone without ``shift`` from no acceleration [m/s^2]."""
+        return self.radius / math.hypot(1.0, self.slope)
+
+    def shrunk(self, by_m_s2: float) -> Cone:
+        """The cone for which a plus anything of up to ``by_m_s2`` on each axis stays in this one."""
+        across = math.sqrt(2.0 if self.level else 3.0)
+        return replace(self, radius=max(self.radius - (across + self.slope) * by_m_s2, 0.0))
 
     def tangent(self, a: Vec3) -> tuple[FloatArray, float]:
         """The cone's tangent in the direction of ``a`` as ``normal @ a >= floor``, ``normal`` (3,) of length 1.

@@ -184,7 +184,7 @@ class SafetyFilter:
         stops = [] if task.stops is None else _stop_records(task, found, task.stops)
         records = (*obstacles, *stops, *limits)
         worst = min(records, key=lambda record: record.slack, default=None)
-        if verdict is Verdict.ADJUSTED and worst is not None and worst.slack < -self._safety.tolerance_m_s2:
+        if verdict is Verdict.ADJUSTED and worst is not None and not worst.slack >= -self._safety.tolerance_m_s2:
             verdict = Verdict.RELAXED
         self._last = a = frozen(a)
         self._epsilon = dict(zip(rows.ids, found.epsilon.tolist(), strict=True))

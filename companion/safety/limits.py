@@ -1,10 +1,11 @@
 """Limits of the vehicle as constraints on the same acceleration.
 
 What the vehicle cannot exceed is kept by every answer: the acceleration box, slew (a box about the last setpoint, one
-tick wide), norm and tilt (`cone`). Arena with floor and ceiling: one braking distance ahead of each wall (`stopping`),
-a bound on one component of a; braking counts on a share of the box only, so that lag and disturbance find something
-left. Speed: |v + a t| <= v_max with t = dt, and with a slew limit the time to slew from the box to nothing on top;
-above it, slow down by half of what the box allows.
+tick wide), norm and tilt (`cone`), each less what the disturbance estimate may add on the wire. Arena with floor and
+ceiling: one braking distance ahead of each wall (`stopping`), a bound on one component of a; braking counts on a share
+of what the vehicle has only, so that lag and disturbance find something left, and where norm or tilt bind on no more
+than three walls at once leave each of them. Speed: |v + a t| <= v_max with t = dt, and with a slew limit the time to
+slew from the box to nothing on top; above it, slow down by half of what the box allows.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from companion.config import LimitsConfig
-from companion.safety.cone import G_M_S2, Cone, norm_cone, speed_cone, tilt_cone
+from companion.safety.cone import Cone, norm_cone, speed_cone, tilt_cone
 from companion.safety.stopping import Braking
 from companion.types import FloatArray, Vec3
 
-BRAKING_SHARE = 0.7  # of the acceleration box, counted on for stopping at a wall
+BRAKING_SHARE = 0.7  # of the acceleration in every direction, counted on for stopping at a wall
 ROUNDING_M_S2 = 1e-9  # a reference clipped to the same box by someone else may differ in the last bits
 _DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
 
@@ -65,8 +67,13 @@ class VehicleLimits:
         """How far each of ``a`` (C, 3) breaks the speed limit, 0 where it holds [m/s^2]."""
         return np.maximum(self.speed.excess(a), 0.0) if self.may_speed else np.zeros(len(a))
 
+    def within(self, a: FloatArray, tolerance_m_s2: float) -> npt.NDArray[np.bool_]:
+        """Whether each of ``a`` (C, 3) is inside box, slew and what of the arena they can keep, (C,)."""
+        inside = (a >= self.low - tolerance_m_s2) & (a <= self.high + tolerance_m_s2)
+        return np.asarray(np.logical_and.reduce(inside, axis=-1))
+
     def clip(self, a: FloatArray) -> FloatArray:
-        """``a`` (C, 3) into box, slew, arena and cones."""
+        """``a`` (C, 3) into box, slew and arena, then the cones, which may lead out of the arena again."""
         return self._into(a, self.low, self.high)
 
     def clip_hard(self, a: FloatArray) -> FloatArray:
@@ -76,7 +83,7 @@ class VehicleLimits:
     def _into(self, a: FloatArray, low: Vec3, high: Vec3) -> FloatArray:
         clipped = np.maximum(a, low)
         np.minimum(clipped, high, out=clipped)
-        for cone in self.cones:  # towards a point inside: what is nearer to it stays within the limits before
+        for cone in self.cones:  # towards a point inside of what the vehicle can do: box and slew stay kept
             clipped = self.inside + cone.share(self.inside, clipped)[:, None] * (clipped - self.inside)
         return clipped
 
@@ -94,16 +101,17 @@ class Capability:
 def capability(config: LimitsConfig, *, shrink_m_s2: float, dt_s: float) -> Capability:
     """The same for every tick of one configuration."""
     box = max(config.acceleration_m_s2 - shrink_m_s2, 0.0)
-    cones, authority = [], box
+    cones = []
     if config.norm_m_s2 is not None:
         cones.append(norm_cone(config.norm_m_s2))
-        authority = min(authority, config.norm_m_s2)
     if config.tilt_deg is not None:
         cones.append(tilt_cone(config.tilt_deg))
-        authority = min(authority, G_M_S2 * math.sin(math.radians(config.tilt_deg)))
+    cones = [cone.shrunk(shrink_m_s2) for cone in cones]
     corners = box * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
     binding = tuple(cone for cone in cones if cone.excess(corners).max() > 0.0)
-    return Capability(box, Braking(BRAKING_SHARE * authority, dt_s, config.slew_m_s3), authority, binding)
+    authority = min(box, *(cone.reach for cone in binding)) if binding else box
+    share = min(BRAKING_SHARE, 1.0 / _DIAGONAL) if binding else BRAKING_SHARE
+    return Capability(box, Braking(share * authority, dt_s, config.slew_m_s3), authority, binding)
 
 
 def vehicle_limits(

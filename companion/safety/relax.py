@@ -85,7 +85,9 @@ def least_violation(task: Task, ways: Ways, order: tuple[str, ...]) -> Found:
     starts = limits.clip_hard(ways.offered)
     ranks, offered = by_contact(rows), shares(rows, starts)
     favoured = offered.take(ranks, axis=1)
-    favoured[0] += KEEP_WAY * (favoured[0] < 1.0)
+    mine, more = favoured[0].copy(), favoured[0] + KEEP_WAY
+    more = np.where(mine < 0.0, np.maximum(mine, np.minimum(more, -_STEP)), more)  # a touch stays one
+    favoured[0] = np.where(mine < 1.0, more, mine)
     first = widest(favoured)
     a = starts[first]
     kept = np.full((len(rows), 2), -np.inf)  # shares over the horizon and at its end that may not be lost
@@ -148,7 +150,7 @@ def _share_program(task: Task, a: Vec3, kept: FloatArray, raised: npt.NDArray[np
 
 
 def _limit_part(task: Task, a: Vec3, after: int) -> tuple[FloatArray, FloatArray, int]:
-    """Cones (kept), speed, stops, arena (each with what it is broken by), room for ``after`` rows, where that begins."""
+    """Cones (kept), speed, stops, arena (each with what breaks it), room for ``after`` rows, and where that begins."""
     limits = task.limits
     extra, bound = limit_rows(task, a, _VARIABLES)
     walls = len(extra)

@@ -84,16 +84,18 @@ class Judgement:
 
 
 def judge(task: Task, a: FloatArray) -> Judgement:
-    """True rows and limits at ``a`` (C, 3), within box, slew, arena and cones, all in one batch."""
+    """True rows and limits at ``a`` (C, 3), within box, slew and cones, all in one batch."""
     config = task.config
     lower, upper = decay_interval(task.rows.evaluate_many(a), task.rows.least_decay)
     lower /= config.alpha2
     upper /= config.alpha2
     admissible = np.logical_and.reduce(lower <= upper, axis=-1)
+    if task.limits.cones:  # what is pulled into a cone may leave the arena
+        admissible &= task.limits.within(a, config.tolerance_m_s2)
     if task.limits.may_speed:
         admissible &= task.limits.fast(a) <= config.tolerance_m_s2
     if task.stops is not None:
-        admissible &= np.minimum.reduce(task.stops.slack(a), axis=-1) >= -config.tolerance_m_s2
+        admissible &= np.minimum.reduce(task.stops.slack(a), axis=-1, initial=np.inf) >= -config.tolerance_m_s2
     deviation = np.minimum(np.maximum(task.star, lower), upper)
     deviation -= task.star
     deviation *= deviation

@@ -62,3 +62,31 @@ def test_what_starts_safe_stays_safe(name: str, seed: int, count: int) -> None:
         nearest = float(np.linalg.norm(p - o, axis=1).min())
         assert nearest > 0.4
         assert nearest >= D_M - 1e-6 or not kept
+
+
+@pytest.mark.parametrize("name", [*LIMITS, "norm and slew"])
+@pytest.mark.parametrize("push", [(3.0, 1.0, 0.0), (3.0, 0.0, 3.0), (3.0, 3.0, 3.0), (2.0, -3.0, -3.0)])
+def test_no_push_leads_out_of_the_arena(name: str, push: tuple[float, float, float]) -> None:
+    """Against one, two and three walls at once, with norm, tilt and slew; the half step is exact integration's."""
+    limits = LIMITS[name] if name in LIMITS else LimitsConfig(norm_m_s2=2.0, slew_m_s3=6.0)
+    guard, before = SafetyFilter(SAFETY, limits), np.zeros(3)
+    p, v = np.array([2.0, 2.0, 4.0]), np.zeros(3)
+    nothing = predicted(np.zeros((0, 3)), np.zeros((0, 3)))
+    for _ in range(170):
+        result = guard.step(FilterInput(p, v, np.array(push), nothing, elapsed_s=DT, a_before=before))
+        before = result.a_safe
+        p, v = p + DT * v + 0.5 * DT**2 * before, v + DT * before
+        assert (p <= np.array(limits.arena_max) + 0.02).all()
+        assert (p >= np.array(limits.arena_min) - 0.02).all()
+
+
+def test_a_large_obstacle_far_away_and_a_wall_have_an_answer() -> None:
+    """Nothing is within reach, but the reference does not pass: the search has rows of no obstacle at all."""
+    guard = SafetyFilter(SAFETY, LimitsConfig())
+    t = np.array([[-9.0, 0.0, 3.0]])
+    far = predicted(t, np.zeros((1, 3)))
+    large = Prediction(0, DT, far.ids, far.p_enu, far.sigma_m, far.v_enu, far.a_enu, frozen([3.0]))
+    result = guard.step(
+        FilterInput(np.array([9.5, 0.0, 3.0]), np.array([2.0, 0.0, 0.0]), np.array([2.0, 0.0, 0.0]), large)
+    )
+    assert result.verdict is Verdict.RELAXED or result.a_safe[0] < 0.0

@@ -101,3 +101,12 @@ def test_default_file_is_the_defaults() -> None:
 def test_a_confirmation_that_can_never_come_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"tracking\.confirm_hits: expected at most confirm_frames \+ 1 = 4, got 5"):
         parse_config({"tracking": {"confirm_hits": 5, "confirm_frames": 3}})
+
+
+def test_the_disturbance_estimate_must_leave_the_vehicle_something() -> None:
+    """Reserves of the whole box would turn the reference round."""
+    with pytest.raises(
+        ConfigError, match=r"limits\.acceleration_m_s2: expected more than disturbance\.bound_m_s2 = 0\.3"
+    ):
+        parse_config({"limits": {"acceleration_m_s2": 0.3}})
+    assert parse_config({"limits": {"acceleration_m_s2": 0.2}, "disturbance": {"enabled": False}})

@@ -46,6 +46,8 @@ def row_by_definition(
         config.kappa * math.hypot(prediction.sigma_m[j, min(i + 2, round(config.sigma_growth_s / dt))], p_std_m),
         config.sigma_cap_m,
     )
+    now = math.hypot(prediction.sigma_m[j, min(2, round(config.sigma_growth_s / dt))], p_std_m)
+    sigma += min(config.kappa_now * now, config.sigma_cap_m)
     delay = config.sigma_delay_s * float(np.linalg.norm(prediction.v_enu[j] - V))
     d = config.drone_radius_m + prediction.radius_m[j] + config.cushion_m + sigma + delay
     keep = d * d if config.form == "paper" else 0.5 * d * d
@@ -54,7 +56,7 @@ def row_by_definition(
     return psi[1] - psi[0] + config.alpha2 * epsilon * psi[0]
 
 
-@pytest.mark.parametrize("config", [SafetyConfig(), SafetyConfig(form="paper", horizon=5, kappa=0.0)])
+@pytest.mark.parametrize("config", [SafetyConfig(), SafetyConfig(form="paper", horizon=5, kappa=0.0, kappa_now=0.0)])
 @pytest.mark.parametrize("epsilon", [0.0, 0.7, 2.0])
 def test_rows_equal_their_definition(config: SafetyConfig, epsilon: float) -> None:
     prediction = make_prediction(config)
@@ -112,7 +114,7 @@ def test_first_row_of_a_head_on_obstacle_by_hand() -> None:
 
     r_2 = -2 + 0.0025 a, so rise_0 = h_2 - h_1 = 0.5 ((2 - 0.0025 a)^2 - 4) = -0.005 a + 3.125e-6 a^2.
     """
-    config = SafetyConfig(kappa=0.0, sigma_delay_s=0.0)
+    config = SafetyConfig(kappa=0.0, kappa_now=0.0, sigma_delay_s=0.0)
     prediction = Prediction(
         0,
         0.05,
@@ -131,7 +133,7 @@ def test_first_row_of_a_head_on_obstacle_by_hand() -> None:
 
 
 def test_margin_parts_are_kept_apart() -> None:
-    config = SafetyConfig(kappa=2.0, sigma_delay_s=0.1)
+    config = SafetyConfig(kappa=2.0, kappa_now=0.0, sigma_delay_s=0.1)
     prediction = make_prediction(config, count=1)
     rows = Barrier(config).rows(P, V, prediction, 0.3)
     margin = rows.margins(np.array([4]))[0]
@@ -199,7 +201,7 @@ def test_what_a_row_is_made_of() -> None:
 @pytest.mark.parametrize("growth_s", [0.0, 0.05, 0.1, 0.5, 9.0])
 def test_sigma_counts_up_to_the_end_of_its_growth(growth_s: float) -> None:
     """Instants 2, 3, ... up to the growth's end, which may lie before the first and behind the last of them."""
-    config = SafetyConfig(horizon=12, sigma_growth_s=growth_s, kappa=2.0)
+    config = SafetyConfig(horizon=12, sigma_growth_s=growth_s, kappa=2.0, kappa_now=0.0)
     prediction = make_prediction(config)
     rows = Barrier(config).rows(P, V, prediction, 0.2)
     for i in range(13):
@@ -209,7 +211,7 @@ def test_sigma_counts_up_to_the_end_of_its_growth(growth_s: float) -> None:
 
 def test_sigma_counts_no_further_than_its_cap_and_the_letter_of_22_takes_the_square_root_of_two() -> None:
     for form, factor in (("sphere", 1.0), ("paper", math.sqrt(2.0))):
-        config = SafetyConfig(kappa=2.0, sigma_cap_m=0.25, form=form)
+        config = SafetyConfig(kappa=2.0, kappa_now=0.0, sigma_cap_m=0.25, form=form)
         prediction = make_prediction(config, sigma=0.11)
         rows = Barrier(config).rows(P, V, prediction, 0.0)
         assert rows.sigma_m[:, 0] == pytest.approx([0.242] * 3)  # 2 * 0.11 * 1.1
@@ -230,7 +232,7 @@ def test_margins_are_those_of_each_obstacle_at_its_own_step() -> None:
 
 
 def test_inside_the_keep_out_distance_there_is_a_least_decay() -> None:
-    config = SafetyConfig(kappa=0.0, sigma_delay_s=0.0, recovery=0.07)
+    config = SafetyConfig(kappa=0.0, kappa_now=0.0, sigma_delay_s=0.0, recovery=0.07)
     start = np.array([[0.45, 0.0, 0.0], [0.55, 0.0, 0.0]])
     prediction = Prediction(
         0,
@@ -322,3 +324,15 @@ def test_a_ball_is_within_reach_if_it_meets_the_box(
         np.ones(1), np.tile(np.reshape(centre, (3, 1, 1)), (1, 1, count)), np.array([square]), np.ones((1, count))
     )
     assert balls.reachable(-box, box).tolist() == [reached]
+
+
+def test_the_present_sigma_counts_on_top_of_every_row() -> None:
+    """1.5 sigma_k + 2.5 sigma_2, the vehicle's own position in both; the cap is for each alone."""
+    prediction = make_prediction(SafetyConfig(), sigma=0.1)
+    rows = Barrier(SafetyConfig(kappa=1.5, kappa_now=2.5, sigma_growth_s=0.3)).rows(P, V, prediction, 0.05)
+    now = 2.5 * math.hypot(0.11, 0.05)
+    assert rows.sigma_m[0, 0] == pytest.approx(1.5 * math.hypot(0.11, 0.05) + now)
+    assert rows.sigma_m[0, 3] == pytest.approx(1.5 * math.hypot(0.125, 0.05) + now)
+    assert rows.sigma_m[0, 20] == pytest.approx(1.5 * math.hypot(0.13, 0.05) + now)
+    capped = Barrier(SafetyConfig(kappa=0.5, kappa_now=9.0, sigma_cap_m=0.2)).rows(P, V, prediction, 0.0)
+    assert capped.sigma_m[0, 0] == pytest.approx(0.5 * 0.11 + 0.2)

@@ -89,3 +89,19 @@ def test_from_a_point_outside_no_way_leads_further_out() -> None:
 def test_a_nanometre_per_second_squared_from_the_axis_is_on_it() -> None:
     assert norm_cone(2.0).tangent(np.array([0.0, 1e-9, 0.0]))[0].tolist() == [-1.0, 0.0, 0.0]
     assert norm_cone(2.0).tangent(np.array([0.0, 1e-8, 0.0]))[0].tolist() == [0.0, -1.0, 0.0]
+
+
+@pytest.mark.parametrize("cone", [norm_cone(2.5), tilt_cone(20.0)])
+def test_a_shrunk_cone_leaves_room_for_the_worst_corner(cone: Cone) -> None:
+    small = cone.shrunk(0.3)
+    surface = POINTS[cone.excess(POINTS) > 0.0]
+    edge = small.share(np.zeros(3), surface)[:, None] * surface
+    corners = 0.3 * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+    worst = max(float(cone.excess(edge + corner).max()) for corner in corners)
+    assert -0.1 < worst <= 1e-9
+    assert cone.shrunk(9.0).radius == 0.0
+
+
+def test_reach_is_the_shortest_way_out() -> None:
+    assert norm_cone(2.5).reach == 2.5
+    assert tilt_cone(30.0).reach == pytest.approx(G_M_S2 * 0.5)

@@ -151,8 +151,10 @@ def test_norm_and_tilt_are_asked_where_a_corner_of_the_box_breaks_them() -> None
 def test_authority_is_what_every_direction_has() -> None:
     tilted = capability(LimitsConfig(tilt_deg=10.0), shrink_m_s2=0.0, dt_s=0.05)
     assert tilted.authority_m_s2 == pytest.approx(9.80665 * np.sin(np.radians(10.0)))
-    assert tilted.braking.a_m_s2 == pytest.approx(BRAKING_SHARE * tilted.authority_m_s2)
-    assert capability(LimitsConfig(norm_m_s2=1.5), shrink_m_s2=0.5, dt_s=0.05).authority_m_s2 == 1.5
+    assert tilted.braking.a_m_s2 == pytest.approx(tilted.authority_m_s2 / np.sqrt(3.0))  # three walls at once
+    assert capability(LimitsConfig(norm_m_s2=1.5), shrink_m_s2=0.5, dt_s=0.05).authority_m_s2 == pytest.approx(
+        1.5 - 0.5 * np.sqrt(3.0)  # whatever the disturbance estimate adds stays inside
+    )
     assert capability(LimitsConfig(norm_m_s2=9.0), shrink_m_s2=0.5, dt_s=0.05).authority_m_s2 == 2.5
     directions = np.random.default_rng(0).standard_normal((500, 3))
     directions *= 0.999 * tilted.authority_m_s2 / np.linalg.norm(directions, axis=1, keepdims=True)

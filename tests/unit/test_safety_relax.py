@@ -405,3 +405,15 @@ def test_braking_takes_what_is_admissible_before_what_is_wide() -> None:
     )  # slower after it than straight braking
     resting = task_of(inputs_of([], [], speed=(0.0, 0.0, 0.0)))
     assert braking(resting, Ways(resting, np.array([1.0, 0.0, 0.0]))).a.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_the_last_way_is_not_kept_where_it_touches_and_another_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A share of -0.05 and its bonus of 0.15 are still a touch; 0.0 of another way is none."""
+    task = task_of(inputs_of([(1.2, 0.02, 0.0)], [(0.0, 0.0, 0.0)]))
+    offered = np.full((45, 1), -0.9)
+    offered[0], offered[7] = -0.05, 0.0
+    monkeypatch.setattr(relax, "shares", lambda *_: offered.copy())
+    programs = Programs(monkeypatch, [(0.0, 0.0, 0.0, 0.5, 0.5)] * 9)
+    ways = Ways(task, np.array([1.0, 1.0, 1.0]))
+    least_violation(task, ways, ("daqp",))
+    assert programs.asked[0][0].tolist() == task.limits.clip_hard(ways.offered)[7].tolist()
