@@ -131,12 +131,12 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     lambda_delta: Positive = 0.01
     drone_radius_m: Positive = 0.2
     cushion_m: NonNegative = 0.1
-    kappa: NonNegative = 2.5
-    sigma_growth_s: NonNegative = 0.5  # predicted sigma counts up to this far ahead; the next looks correct the rest
-    sigma_cap_m: Positive = 1.5  # kappa sigma counts no further than this: a track just born is no wall
+    kappa: NonNegative = 2.2
+    sigma_growth_s: NonNegative = 0.7  # predicted sigma counts up to this far ahead; the next looks correct the rest
+    sigma_cap_m: Positive = 2.0  # kappa sigma counts no further than this: a track just born is no wall
     sigma_delay_s: NonNegative = 0.01
     braking: bool = True  # brake before what is too large to swerve round within the horizon
-    recovery: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02  # least decay of psi per dt_s inside the keep-out distance
+    recovery: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.2  # least decay of psi per dt_s inside the keep-out distance
     solver: Literal["daqp", "osqp"] = "daqp"
     iterations: Annotated[int, Meta(ge=1, le=50)] = 4
     tolerance_m_s2: Positive = 1e-6

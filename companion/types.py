@@ -139,8 +139,8 @@ class Margin:
 class RowRecord:
     """One row that shaped the answer. ``slack`` >= 0 where the true row holds, in m/s^2."""
 
-    track: str  # track id, or "arena", "floor", "ceiling", "speed"
-    step: int  # horizon step i, -1 for vehicle limits
+    track: str  # track id, or "arena", "floor", "ceiling", "speed", "norm", "tilt"
+    step: int  # horizon step i; -1 for vehicle limits, and for the braking distance to an obstacle
     slack: float
     margin: Margin | None
     epsilon: float

@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from companion.errors import CompanionError, ConfigError
 from companion.policy import artifact_folder
 
 TRAIN_EXAMPLE = "example: policies train --seed 1 --out runs/first && policies evaluate runs/first/artifact"
 EVALUATE_EXAMPLE = "example: policies evaluate builtin:default --starts 200 --json"
+ENCOUNTERS_EXAMPLE = "example: policies encounters --flights 2000 --noise 0.2236 --json"
+
+
+class _Parser(argparse.ArgumentParser):
+    """Wrong usage is one line that names the option."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="policies", description="Train, export and evaluate policies.")
+    parser = _Parser(prog="policies", description="Train, export and evaluate policies.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     train = commands.add_parser("train", help="train a policy with PPO", epilog=TRAIN_EXAMPLE)
     train.add_argument("--preset", choices=("default", "paper"), default="default", help="task and hyperparameters")
@@ -54,14 +64,56 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--seed", type=_count, default=20_011, help="of the starts and targets")
     evaluate.add_argument("--json", action="store_true", help="one JSON object on stdout")
     evaluate.set_defaults(command=_evaluate)
+    _add_encounters(commands)
     return parser
 
 
+def _add_encounters(commands: argparse._SubParsersAction[_Parser]) -> None:
+    encounters = commands.add_parser(
+        "encounters", help="fly tracker and filter against obstacles timed to hit", epilog=ENCOUNTERS_EXAMPLE
+    )
+    encounters.add_argument("--obstacles", type=_positive, default=1, help="in each encounter")
+    encounters.add_argument("--flights", type=_positive, default=2000)
+    encounters.add_argument("--noise", type=_not_negative, default=0.2236, help="of the sensor, 1 sigma an axis [m]")
+    encounters.add_argument("--latency", type=_not_negative, default=0.05, help="of the sensor [s]")
+    encounters.add_argument("--dropout", type=_share, default=0.0, help="share of the sensor's frames that are lost")
+    encounters.add_argument("--seed", type=_count, default=20_000, help="of the first flight; the next has the next")
+    encounters.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration (default: the defaults)")
+    encounters.add_argument("--jobs", type=_positive, default=os.cpu_count() or 1, help="processes (default: all CPUs)")
+    encounters.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    encounters.set_defaults(command=_encounters)
+
+
 def _count(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"expected a whole number, not negative, got {value}")
+    return _whole(text, 0)
+
+
+def _positive(text: str) -> int:
+    return _whole(text, 1)
+
+
+def _whole(text: str, least: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least {least}, got {text}")
     return value
+
+
+def _not_negative(text: str, most: float = 1e6) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value <= most:
+        raise argparse.ArgumentTypeError(f"expected a number from 0 to {most:g}, got {text}")
+    return value
+
+
+def _share(text: str) -> float:
+    return _not_negative(text, 1.0)
 
 
 def _require_train_extra() -> None:
@@ -102,6 +154,24 @@ def _evaluate(args: argparse.Namespace) -> int:
     from policies.evaluation.artifact import evaluate
 
     figures = evaluate(artifact_folder(args.artifact), starts=args.starts, seed=args.seed)
+    _print(figures, args.json)
+    return 0
+
+
+def _encounters(args: argparse.Namespace) -> int:
+    from companion.config import Config, load_config
+    from policies.display import encounters_display
+    from policies.evaluation.campaign import fly_all, report
+    from policies.evaluation.encounters import Sensor
+
+    config = load_config(args.config) if args.config else Config()
+    sensor = Sensor(noise_std_m=args.noise, latency_s=args.latency, dropout=args.dropout)
+    seeds = range(args.seed, args.seed + args.flights)
+    with encounters_display(args.flights) as show:
+        outcomes = fly_all(seeds, args.obstacles, config, sensor, jobs=args.jobs, on_outcome=show)
+    figures = report(outcomes).to_json()
+    if not args.json:
+        figures |= {f"share_of_{name}": share for name, share in figures["verdict_shares"].items()}
     _print(figures, args.json)
     return 0
 

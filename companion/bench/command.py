@@ -16,6 +16,8 @@ examples:
   companion bench tracking                accuracy, identity and time of the tracker beside its rivals (minutes)
   companion bench tracking --quick        the two headline conditions on fewer trials (under two minutes)
   companion bench tracking --json > tracking.json
+  companion bench filter                  time of the safety filter beside cbfpy, OSQP and quadprog (minutes)
+  companion bench filter --quick --json   fewer states and flights, one JSON object
 """
 
 _TRACKING = """\
@@ -26,6 +28,13 @@ for a minute, and the time of an update and prediction beside filterpy's update 
 from those that anything was tuned on. filterpy is part of the dev extra; without it its rows are left out.
 """
 
+_FILTER = """\
+Times the safety filter (rows, solve, verify, whole) over states in which some row refuses the reference, with 1, 10,
+20 and 100 obstacles and N = 5 and 20: with DAQP and with OSQP, and beside cbfpy, compiled, on its own double integrator
+with the same obstacles. The filter's programs are given to DAQP, OSQP and quadprog too. Then whole flights past
+obstacles, with and without noise, in which sign changes of the correction are counted. Seeds are fixed. cbfpy and
+quadprog are in the bench extra; without them their columns are left out.
+"""
 
 TICKS = 1000  # timed with one and ten obstacles, a tenth with a hundred
 
@@ -55,6 +64,16 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     tracking.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else there")
     tracking.set_defaults(handler=_tracking)
+    safety = parts.add_parser(
+        "filter",
+        help="the safety filter: time where it acts, solvers, chatter",
+        description=_FILTER,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    safety.add_argument("--quick", action="store_true", help="the conditions with figures only, on fewer states")
+    safety.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else there")
+    safety.set_defaults(handler=_filter)
 
 
 def _tracking(arguments: argparse.Namespace) -> int:
@@ -96,6 +115,42 @@ def _tracking(arguments: argparse.Namespace) -> int:
         _print_json(envelope("tracking", tracking.as_json(results, crossings, times), figures))
     else:
         print_tracking(results, crossings, times, figures)
+    return 0
+
+
+def _filter(arguments: argparse.Namespace) -> int:
+    from companion.bench import cbfpy_rival, chatter, filter, programs
+    from companion.bench.envelope import envelope
+    from companion.bench.filter_tables import print_filter
+    from companion.bench.filter_timing import Condition, FilterTiming, measure_timing
+
+    backends = cbfpy_rival.backends()
+    for name, present in (("cbfpy", bool(backends)), ("quadprog", programs.available())):
+        if not present:
+            print(f"companion: bench filter: without {name}: {cbfpy_rival.HOW_TO_INSTALL}", file=sys.stderr)
+    quick = arguments.quick
+    conditions = filter.HEADLINE if quick else filter.CONDITIONS
+    states, count = (filter.QUICK_STATES, filter.QUICK_PROGRAMS) if quick else (filter.STATES, filter.PROGRAMS)
+    flights = filter.QUICK_FLIGHTS if quick else chatter.FLIGHTS
+    times: list[FilterTiming] = []
+    solved: list[programs.ProgramTiming] = []
+    encounters: list[chatter.Encounter] = []
+
+    def measure(condition: Condition) -> None:
+        times.append(measure_timing(condition, states, backends=backends))
+        solved.append(programs.measure_programs(condition, count))
+
+    def fly(name: str, sigma_m: float) -> None:
+        encounters.append(chatter.measure_encounter(name, sigma_m, flights))
+
+    jobs: list[tuple[str, Callable[[], None]]] = [(one.name, partial(measure, one)) for one in conditions]
+    jobs += [(f"{name}, sigma {s:g}", partial(fly, name, s)) for s in chatter.SIGMAS_M for name in chatter.ENCOUNTERS]
+    _run(jobs)
+    figures, free_s = filter.figures(times), chatter.free_s()
+    if arguments.json:
+        _print_json(envelope("filter", filter.as_json(times, solved, encounters, free_s), figures))
+    else:
+        print_filter(times, solved, encounters, free_s, figures)
     return 0
 
 

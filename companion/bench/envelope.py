@@ -47,6 +47,7 @@ def _machine() -> dict[str, Any]:
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
+        "load_1min": round(os.getloadavg()[0], 2),  # above the cores, tails of time are the scheduler's
         "python": platform.python_version(),
         "numpy": np.__version__,
         "system": platform.platform(),

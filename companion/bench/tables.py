@@ -23,7 +23,7 @@ def print_tracking(
     figures: list[Figure],
 ) -> None:
     """All tables of `companion bench tracking`."""
-    console = Console(width=130)
+    console = Console(width=130, markup=False)  # brackets are units
     for result in results:
         if result.cell in HEADLINE:
             console.print(_ahead_table(result))
@@ -33,12 +33,13 @@ def print_tracking(
         console.print(_cells_table(others))
     console.print(_crossing_table(crossings))
     console.print(_time_table(times))
-    console.print(_figure_table(figures))
+    console.print(figure_table(figures))
 
 
-def _table(title: str, *columns: str) -> Table:
+def titled(title: str, *columns: str) -> Table:
+    """A table whose first column is text, the others aligned to the right."""
     table = Table(title=title, title_justify="left", title_style="bold")
-    table.add_column(columns[0])
+    table.add_column(columns[0], no_wrap=True)
     for column in columns[1:]:
         table.add_column(column, justify="right")
     return table
@@ -50,7 +51,7 @@ def _names(result: CellResult) -> list[str]:
 
 def _ahead_table(result: CellResult) -> Table:
     names = _names(result)
-    table = _table(f"{result.cell.name}: RMSE of the position 0.25 s ahead [m]", "motion", *names, "ours / hindsight")
+    table = titled(f"{result.cell.name}: RMSE of the position 0.25 s ahead [m]", "motion", *names, "ours / hindsight")
     for index, motion in enumerate(MOTIONS):
         values = {name: float(result.filters[name].ahead_m[0][index]) for name in names}
         ratio = values["ours"] / values["hindsight"]
@@ -63,7 +64,7 @@ def _ahead_table(result: CellResult) -> Table:
 
 def _ours_table(result: CellResult) -> Table:
     title = f"{result.cell.name}: ours, and hindsight in brackets"
-    table = _table(title, "motion", "now [m]", "velocity [m/s]", "+0.5 s [m]", "in 95 % at +0.25 s", "NEES (true: 3)")
+    table = titled(title, "motion", "now [m]", "velocity [m/s]", "+0.5 s [m]", "in 95 % at +0.25 s", "NEES (true: 3)")
     ours, best = result.filters["ours"], result.filters["hindsight"]
     for index, motion in enumerate(MOTIONS):
         pairs = [(ours.now_m, best.now_m), (ours.velocity_m_s, best.velocity_m_s), (ours.ahead_m[1], best.ahead_m[1])]
@@ -76,7 +77,7 @@ def _ours_table(result: CellResult) -> Table:
 
 def _cells_table(results: list[CellResult]) -> Table:
     names = _ORDER[:-1]
-    table = _table(
+    table = titled(
         "other conditions: mean RMSE of the position 0.25 s ahead [m]",
         "condition",
         *names,
@@ -98,7 +99,7 @@ def _cells_table(results: list[CellResult]) -> Table:
 
 
 def _crossing_table(crossings: Mapping[int, Mapping[str, CrossingResult]]) -> Table:
-    table = _table(
+    table = titled(
         "ten anonymous obstacles crossing for 60 s, 5 % clutter, 5 % lost, sigma 0.05 m",
         "filter",
         *(f"swaps, seed {seed}" for seed in crossings),
@@ -115,7 +116,7 @@ def _crossing_table(crossings: Mapping[int, Mapping[str, CrossingResult]]) -> Ta
 
 
 def _time_table(times: list[Timing]) -> Table:
-    table = _table(
+    table = titled(
         "time [ms]: update from a frame, prediction of 22 instants with covariance; filterpy: update only",
         "obstacles",
         "update p50",
@@ -134,16 +135,18 @@ def _time_table(times: list[Timing]) -> Table:
         ours = (timing.update.p50, timing.predict.p50, both.p50, both.p99, both.p999, both.max)
         rival = (None, None) if theirs is None else (theirs.p50, theirs.p99)
         speed_up = "-" if timing.speed_up is None else f"{timing.speed_up:.0f}"
-        table.add_row(str(timing.obstacles), *(_milliseconds(value) for value in (*ours, *rival)), speed_up)
+        table.add_row(str(timing.obstacles), *(milliseconds(value) for value in (*ours, *rival)), speed_up)
     return table
 
 
-def _milliseconds(value: float | None) -> str:
+def milliseconds(value: float | None) -> str:
+    """A table's cell; None: too few samples."""
     return "-" if value is None else f"{value:.3f}"
 
 
-def _figure_table(figures: list[Figure]) -> Table:
-    table = _table("figures", "figure", "measured", "limit", "")
+def figure_table(figures: list[Figure]) -> Table:
+    """Every figure beside its limit."""
+    table = titled("figures", "figure", "measured", "limit", "")
     for figure in figures:
         limit = f"{figure.relation} {figure.limit:g}"
         table.add_row(figure.name, f"{figure.value:.3f}", limit, "met" if figure.met else "MISSED")

@@ -34,7 +34,7 @@ from companion.safety.limits import Capability, capability, vehicle_limits
 from companion.safety.relax import braking, least_violation
 from companion.safety.search import least_of_ways
 from companion.safety.stopping import StopRows, stop_rows, swerve_m
-from companion.safety.task import Found, Task, turned
+from companion.safety.task import Found, Task, Ways, turned
 from companion.types import FilterResult, FloatArray, Prediction, RowRecord, Vec3, Verdict, frozen
 
 _DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
@@ -153,14 +153,14 @@ class SafetyFilter:
         a_ref = turned(reduced.rows, task.a_ref)
         if a_ref is not task.a_ref:
             reduced = replace(reduced, a_ref=a_ref)
-        last = a_ref if self._last is None else self._last
+        ways = Ways(reduced, a_ref if self._last is None else self._last)
         verdict = Verdict.ADJUSTED
         try:
-            found = least_of_ways(reduced, balls, last, self._order)
+            found = least_of_ways(reduced, balls, ways, self._order)
             if not found.admissible:
-                found = least_violation(reduced, last, self._order)
+                found = least_violation(reduced, ways, self._order)
         except SolverError:
-            found, verdict = braking(reduced, last), Verdict.BRAKING
+            found, verdict = braking(reduced, ways), Verdict.BRAKING
         values = task.rows.evaluate(found.a)
         if reduced.rows is task.rows:
             return Answer(found, values, verdict)

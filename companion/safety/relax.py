@@ -23,7 +23,7 @@ from companion.safety.adapt import decay_interval
 from companion.safety.barrier import BarrierRows
 from companion.safety.qp import UNBOUNDED, Program, solve
 from companion.safety.search import limit_rows
-from companion.safety.task import Found, Task, candidates, judge
+from companion.safety.task import Found, Task, Ways, judge
 from companion.types import FloatArray, Vec3
 
 SHARE_WEIGHT = 1e6  # cost of the whole margin, against |a - a_ref|^2 in (m/s^2)^2
@@ -34,6 +34,7 @@ SETTLED_M_S2 = 1e-3  # iterates closer than this have converged
 KEPT = 1e-6  # share that an obstacle may lose to those after it: the solver's tolerance
 UNKEPT = 1e3  # a share below which no obstacle can be
 _VARIABLES, _STOP, _ARENA, _SPEED = 8, 5, 6, 7
+_WALLS = np.concatenate((np.eye(3), -np.eye(3)))
 _STEP = 0.05  # of a share: candidates closer than this are equally good for an obstacle
 
 
@@ -72,7 +73,7 @@ def widest(offered: FloatArray) -> int:
     return int(np.lexsort(np.concatenate((-offered.sum(axis=1)[:, None], -keys[:, ::-1]), axis=1).T)[0])
 
 
-def least_violation(task: Task, last: Vec3, order: tuple[str, ...]) -> Found:
+def least_violation(task: Task, ways: Ways, order: tuple[str, ...]) -> Found:
     """The lexicographically least violation, within ``config.iterations`` programs.
 
     The first obstacles each have a program of their own, what comes after them one together, which is repeated.
@@ -81,12 +82,14 @@ def least_violation(task: Task, last: Vec3, order: tuple[str, ...]) -> Found:
         SolverError: no solver has an answer.
     """
     rows, limits, budget = task.rows, task.limits, task.config.iterations
-    starts = limits.clip_hard(np.concatenate((last[None], candidates(task))))
+    starts = limits.clip_hard(ways.offered)
     ranks, offered = by_contact(rows), shares(rows, starts)
-    offered[0] += np.where(offered[0] < 1.0, KEEP_WAY, 0.0)
-    a = starts[widest(offered[:, ranks])]
+    favoured = offered.take(ranks, axis=1)
+    favoured[0] += KEEP_WAY * (favoured[0] < 1.0)
+    first = widest(favoured)
+    a = starts[first]
     kept = np.full((len(rows), 2), -np.inf)  # shares over the horizon and at its end that may not be lost
-    kept[:, 0] = np.minimum(shares(rows, a[None])[0], 0.0) - KEPT  # no obstacle is touched for another's margin
+    kept[:, 0] = np.minimum(offered[first], 0.0) - KEPT  # no obstacle is touched for another's margin
     alone = min(len(ranks) - 1, budget // 2)
     groups = [ranks[j : j + 1] for j in range(alone)] + [ranks[max(alone, 0) :]]
     x, solver = solve(_share_program(task, a, kept, groups[0]), order)
@@ -119,54 +122,58 @@ def _share_program(task: Task, a: Vec3, kept: FloatArray, raised: npt.NDArray[np
     normal = r * (rows.reach[2:] / distance)
     floor = (a @ normal.reshape(3, -1)).reshape(distance.shape) - distance + rows.radii_m[:, None]
     margins = _margins(rows)
-    end = slice(-1, None)
     # of every obstacle what is kept, over the horizon and at its end; of those raised t, and t at the end
-    parts = (
-        (normal, floor + np.maximum(kept[:, :1], -UNKEPT) * margins, np.zeros(floor.size), 3),
-        (normal[..., end], floor[:, end] + np.maximum(kept[:, 1:], -UNKEPT) * margins[:, end], np.zeros(len(rows)), 4),
-        (normal[:, raised], floor[raised], -margins[raised].reshape(-1), 3),
-        (normal[:, raised, end], floor[raised, end], -margins[raised, -1], 4),
-    )
-    tangents, floors = _limit_part(task, a)
-    for slope, least, share, column in parts:
-        part = np.zeros((least.size, _VARIABLES))
-        part[:, :3], part[:, column] = slope.reshape(3, -1).T, share
-        tangents.append(part)
-        floors.append(least.reshape(-1))
+    every, count, high = floor.size, len(rows), len(raised)
+    steps = floor.shape[1]
+    tangents, floors = _limit_part(task, a, every + count + high * (steps + 1))
+    planes, least = normal.reshape(3, -1).T, np.maximum(kept, -UNKEPT)
+    tangents[:every, :3] = planes
+    floors[:every] = (floor + least[:, :1] * margins).reshape(-1)
+    at, last = every + count, planes[steps - 1 :: steps]
+    tangents[every:at, :3] = last
+    floors[every:at] = floor[:, -1] + least[:, 1] * margins[:, -1]
+    to = at + high * steps
+    tangents[at:to, :3], tangents[at:to, 3] = normal[:, raised].reshape(3, -1).T, -margins[raised].reshape(-1)
+    floors[at:to] = floor[raised].reshape(-1)
+    tangents[to : to + high, :3], tangents[to : to + high, 4] = last[raised], -margins[raised, -1]
+    floors[to : to + high] = floor[raised, -1]
     return Program(
         weight=np.full(_VARIABLES, 2.0),
         linear=np.array([*(-2.0 * task.a_ref), -SHARE_WEIGHT, -LEAVE_WEIGHT, STOP_WEIGHT, ARENA_WEIGHT, SPEED_WEIGHT]),
         low=np.array([*limits.hard_low, -UNBOUNDED, -UNBOUNDED, 0.0, 0.0, 0.0]),
         high=np.array([*limits.hard_high, 1.0, 1.0, UNBOUNDED, UNBOUNDED, UNBOUNDED]),
-        rows=np.concatenate(tangents),
-        floor=np.concatenate(floors),
+        rows=tangents,
+        floor=floors,
     )
 
 
-def _limit_part(task: Task, a: Vec3) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Rows of cones (kept), stops, arena and speed (each with what it is broken by)."""
+def _limit_part(task: Task, a: Vec3, before: int) -> tuple[FloatArray, FloatArray]:
+    """Behind room for ``before`` rows: cones (kept), speed, stops and arena (each with what it is broken by)."""
     limits = task.limits
-    tangents, floors = limit_rows(task, a, _VARIABLES)
-    first = len(limits.cones)
+    extra, bound = limit_rows(task, a, _VARIABLES)
+    end = before + len(extra)
+    tangents, floors = np.zeros((end + 6, _VARIABLES)), np.empty(end + 6)
+    tangents[before:end], floors[before:end] = extra, bound
+    first = before + len(limits.cones)
     if limits.may_speed:
         tangents[first, _SPEED] = 1.0
         first += 1
-    tangents[first:, _STOP] = 1.0
-    arena = np.zeros((6, _VARIABLES))
-    arena[:3, :3], arena[3:, :3], arena[:, _ARENA] = np.eye(3), -np.eye(3), 1.0
-    walls = np.concatenate((limits.arena_low, -limits.arena_high))
-    return [tangents, arena], [floors, np.maximum(walls, -UNBOUNDED)]
+    tangents[first:end, _STOP] = 1.0
+    tangents[end:, :3], tangents[end:, _ARENA] = _WALLS, 1.0
+    floors[end : end + 3], floors[end + 3 :] = limits.arena_low, -limits.arena_high
+    np.maximum(floors[end:], -UNBOUNDED, out=floors[end:])
+    return tangents, floors
 
 
-def braking(task: Task, last: Vec3) -> Found:
-    """Without any solver, of the ways to go and a straight stop: admissible first, then widest, then slowest.
+def braking(task: Task, ways: Ways) -> Found:
+    """Without any solver, of ``ways`` and a straight stop: admissible first, then widest, then slowest.
 
     The vehicle is to lose speed along the safest direction, so among equally safe candidates |v + a dt| decides.
     """
     limits, dt_s = task.limits, task.config.dt_s
     speed = math.dist((0.0, 0.0, 0.0), limits.v_enu)
     stop = -limits.v_enu * min(limits.box_m_s2 / max(speed, 1e-9), 1.0 / dt_s)
-    starts = limits.clip(np.concatenate((stop[None], last[None], candidates(task))))
+    starts = limits.clip(np.concatenate((stop[None], ways.offered)))
     judgement = judge(task, starts)
     least = np.minimum.reduce(shares(task.rows, starts), axis=-1, initial=1.0)
     share = np.where(judgement.admissible, 1.0, np.minimum(least, 1.0 - 1e-9))

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from companion.errors import SolverError
 from companion.safety.barrier import Balls
 from companion.safety.qp import UNBOUNDED, Infeasible, Program, solve
-from companion.safety.task import Found, Task, candidates, judge
+from companion.safety.task import Found, Task, Ways, judge
 from companion.types import FloatArray, Vec3
 
 SETTLED_M_S2 = 1e-3  # iterates closer than this have converged: the answer is admissible either way
@@ -36,7 +36,7 @@ _ON = np.array(
 )  # and, from its answer, of the way to a_ref
 
 
-def least_of_ways(task: Task, balls: Balls, last: Vec3, order: tuple[str, ...]) -> Found:
+def least_of_ways(task: Task, balls: Balls, ways: Ways, order: tuple[str, ...]) -> Found:
     """Least cost where the true rows can hold, else an answer that is not admissible.
 
     The way round an obstacle taken in the last tick is kept as long as the rows still leave it open and it is cheap,
@@ -45,17 +45,17 @@ def least_of_ways(task: Task, balls: Balls, last: Vec3, order: tuple[str, ...]) 
 
     Args:
         balls: of the task's rows, at decay 1.
-        last: the last answer.
+        ways: the last answer, and the candidates.
     Raises:
         SolverError: no solver works; `braking` needs none.
     """
     shared, count = form(task, balls), len(task.rows)
-    first = task.limits.clip(last[None])[0]
+    first = task.limits.clip(ways.last[None])[0]
     unjudged = Found(first, np.full(count, 1.0 / task.config.alpha2), False, math.inf, 0, "none")
     found = least_cost(task, shared, unjudged, order)
     if found.cost <= CHEAP:
         return found
-    starts = task.limits.clip(candidates(task))
+    starts = task.limits.clip(ways.offered)
     judgement = judge(task, starts)
     best = int(judgement.ranked.argmin())
     cost = float(judgement.ranked[best])

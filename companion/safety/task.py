@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -102,6 +103,19 @@ def judge(task: Task, a: FloatArray) -> Judgement:
     priced = config.lambda_epsilon * deviation + config.lambda_delta * delta
     cost = config.lambda_u * np.vecdot(away, away) + np.add.reduce(priced, axis=-1)
     return Judgement(lower, upper, admissible, cost)
+
+
+class Ways:
+    """Accelerations to begin a search from: the last answer, and candidates, made once where somebody asks."""
+
+    def __init__(self, task: Task, last: Vec3) -> None:
+        self._task = task
+        self.last = last
+
+    @cached_property
+    def offered(self) -> FloatArray:
+        """The last answer, then the candidates, not yet within limits, (C, 3)."""
+        return np.concatenate((self.last[None], candidates(self._task)))
 
 
 def candidates(task: Task) -> FloatArray:

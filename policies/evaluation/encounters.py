@@ -12,12 +12,12 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from companion.config import Config
+from companion.errors import CompanionError
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.tracking.tracker import Tracker
 from companion.types import (
@@ -40,6 +40,7 @@ LAG_S = 0.1
 REACHED_M = 0.3
 DWELL_S = 1.0  # the target counts as reached where the vehicle then stays within REACHED_M for this long
 TIME_OUT_S = 30.0
+MAX_DRAWS = 1000  # of one seed, before the reference is held to be unable to fly
 WARM_UP_S = 1.0  # the sensor runs this long before the flight, as it does while a vehicle takes off
 
 Reference = Callable[[Vec3, Vec3], Vec3]  # (v_enu, e_enu) -> net acceleration [m/s^2]
@@ -79,6 +80,26 @@ class Flight:
     path: list[Vec3] = field(default_factory=list)
 
 
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one encounter came to, beside its own unobstructed flight."""
+
+    seed: int
+    collided: bool
+    reached: bool  # within TIME_OUT_S
+    clearance_m: float
+    time_ratio: float | None  # to the unobstructed flight; None where either did not reach the target
+    verdicts: dict[str, int]  # ticks under each
+    reversals: int
+    ticks: int
+
+
+def reserve_limit(config: Config) -> float:
+    """The acceleration limit less the disturbance reserve, as the pilot counts it [m/s^2]."""
+    reserve = config.disturbance.bound_m_s2 if config.disturbance.enabled else 0.0
+    return config.limits.acceleration_m_s2 - reserve
+
+
 def stand_in_reference(limit_m_s2: float, speed_m_s: float) -> Reference:
     """A nearly time-optimal reference: the speed from which 0.6 of the limit still stops, chased at 3 / s."""
     braking = 0.6 * limit_m_s2
@@ -108,6 +129,8 @@ class _Loop:
         self._delay_ticks = round(config.actuation_s / TICK_S)
         for step in range(-round(WARM_UP_S / TICK_S), 0):
             self._tracker.update(tuple(self._frames(step, encounter.obstacles)), step * round(TICK_S * NS_PER_S))
+        self._shrink_m_s2 = config.limits.acceleration_m_s2 - reserve_limit(config)
+        self._before: Vec3 | None = None  # the last command; none before the first, as in the pilot
         self._commands: deque[Vec3] = deque([np.zeros(3)] * self._delay_ticks, maxlen=max(self._delay_ticks, 1))
 
     def tick(self, step: int, p: Vec3, v: Vec3, obstacles: tuple[Obstacle, ...]) -> tuple[Vec3, FilterResult | None]:
@@ -125,7 +148,18 @@ class _Loop:
             v_act = v_act + a * TICK_S
         start_ns = now_ns + round(self._delay_ticks * TICK_S * NS_PER_S)
         prediction = self._tracker.predict(start_ns, config.safety.horizon + 3, config.safety.dt_s)
-        result = self._filter.step(FilterInput(p_act, v_act, a_ref, prediction, elapsed_s=TICK_S if step else None))
+        result = self._filter.step(
+            FilterInput(
+                p_act,
+                v_act,
+                a_ref,
+                prediction,
+                accel_shrink_m_s2=self._shrink_m_s2,
+                elapsed_s=TICK_S if step else None,
+                a_before=self._before,
+            )
+        )
+        self._before = result.a_safe
         self._commands.append(result.a_safe)
         return a_ref, result
 
@@ -204,10 +238,14 @@ def _follow(command: Vec3, p: Vec3, v: Vec3, a: Vec3) -> tuple[FloatArray, Vec3,
 
 
 def make_encounter(seed: int, count: int, config: Config, reference: Reference) -> Encounter:
-    """``count`` obstacles timed to cross an 8 m flight; the unfiltered vehicle is hit by the first of them."""
+    """``count`` obstacles timed to cross an 8 m flight; the unfiltered vehicle is hit by the first of them.
+
+    Raises:
+        CompanionError: MAX_DRAWS flights of the seed came to nothing.
+    """
     rng = np.random.default_rng([seed, 0])
     unfiltered = _with_filter(config, "none")
-    while True:
+    for _ in range(MAX_DRAWS):
         heading = rng.uniform(-math.pi, math.pi)
         climb = rng.uniform(-0.15, 0.15)
         level = math.cos(climb)
@@ -230,55 +268,25 @@ def make_encounter(seed: int, count: int, config: Config, reference: Reference) 
         encounter = Encounter(seed, start, target, tuple(obstacles))
         if fly(Encounter(seed, start, target, (obstacles[0],)), unfiltered, reference, Sensor()).clearance_m < 0.0:
             return encounter
+    raise CompanionError(f"encounter {seed}: no flight in {MAX_DRAWS} that arrives alone and is hit unfiltered")
+
+
+def outcome_of(seed: int, count: int, config: Config, reference: Reference, sensor: Sensor) -> Outcome:
+    """Fly the encounter of ``seed`` with ``count`` obstacles, and the same flight without them."""
+    encounter = make_encounter(seed, count, config, reference)
+    free = fly(Encounter(seed, encounter.start_enu, encounter.target_enu, ()), config, reference, sensor)
+    flight = fly(encounter, config, reference, sensor)
+    return Outcome(
+        seed=seed,
+        collided=flight.clearance_m < 0.0,
+        reached=flight.time_s is not None,
+        clearance_m=flight.clearance_m,
+        time_ratio=None if flight.time_s is None or free.time_s is None else flight.time_s / free.time_s,
+        verdicts=dict(flight.verdicts),
+        reversals=flight.reversals,
+        ticks=flight.verdicts.total(),
+    )
 
 
 def _with_filter(config: Config, name: str) -> Config:
     return msgspec.structs.replace(config, safety=msgspec.structs.replace(config.safety, filter=name))
-
-
-@dataclass(frozen=True, slots=True)
-class Report:
-    """A set of encounters in figures."""
-
-    flights: int
-    collisions: int
-    deadlocks: int
-    time_ratio_mean: float
-    time_ratio_p95: float
-    clearance_p1_p10_p50_m: tuple[float, float, float]
-    verdict_shares: dict[str, float]
-    relaxed_ticks_per_flight: float
-    reversals_per_flight: float
-    collided_seeds: tuple[int, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__slots__}
-
-
-def run(seeds: range, count: int, config: Config, reference: Reference, sensor: Sensor) -> Report:
-    """Fly one encounter a seed, each beside its own unobstructed flight."""
-    flights: list[Flight] = []
-    ratios: list[float] = []
-    for seed in seeds:
-        encounter = make_encounter(seed, count, config, reference)
-        free = fly(Encounter(seed, encounter.start_enu, encounter.target_enu, ()), config, reference, sensor)
-        flight = fly(encounter, config, reference, sensor)
-        flights.append(flight)
-        if flight.time_s is not None and free.time_s is not None:
-            ratios.append(flight.time_s / free.time_s)
-    verdicts = sum((flight.verdicts for flight in flights), Counter())
-    ticks = max(verdicts.total(), 1)
-    clearance = np.array([flight.clearance_m for flight in flights])
-    p1, p10, p50 = (float(value) for value in np.percentile(clearance, (1, 10, 50)))
-    return Report(
-        flights=len(flights),
-        collisions=int((clearance < 0.0).sum()),
-        deadlocks=sum(flight.time_s is None for flight in flights),
-        time_ratio_mean=float(np.mean(ratios)) if ratios else math.nan,
-        time_ratio_p95=float(np.percentile(ratios, 95)) if ratios else math.nan,
-        clearance_p1_p10_p50_m=(p1, p10, p50),
-        verdict_shares={name: number / ticks for name, number in sorted(verdicts.items())},
-        relaxed_ticks_per_flight=verdicts["relaxed"] / len(flights),
-        reversals_per_flight=sum(flight.reversals for flight in flights) / len(flights),
-        collided_seeds=tuple(seed for seed, c in zip(seeds, clearance, strict=True) if c < 0.0),
-    )

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from companion.bench import accuracy, command, timing, tracking
+from companion.bench import accuracy, cbfpy_rival, chatter, command, filter, timing, tracking
 from companion.cli import main
 
 
@@ -72,6 +72,50 @@ def test_help_shows_an_example(capsys: pytest.CaptureFixture[str]) -> None:
         main(["bench", "tracking", "--help"])
     assert stopped.value.code == 0
     assert "companion bench tracking --json > tracking.json" in capsys.readouterr().out
+
+
+@pytest.fixture
+def small_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole command on two conditions, a few states and two encounters."""
+    monkeypatch.setattr(filter, "HEADLINE", (filter.Condition(10, 5), filter.BESIDE_CBFPY))
+    monkeypatch.setattr(filter, "QUICK_STATES", 20)
+    monkeypatch.setattr(filter, "QUICK_PROGRAMS", 5)
+    monkeypatch.setattr(filter, "QUICK_FLIGHTS", 1)
+    flown = {name: chatter.ENCOUNTERS[name] for name in ("static", "crossing")}
+    monkeypatch.setattr(chatter, "ENCOUNTERS", flown)
+
+
+@pytest.mark.usefixtures("small_filter")
+def test_filter_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "filter", "--quick", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["bench"], told["schema"]) == ("filter", 1)
+    results = told["results"]
+    assert [one["condition"]["obstacles"] for one in results["timing_ms"]] == [10, 20]
+    for one in results["timing_ms"]:
+        assert one["states"] == 20
+        assert set(one["solvers"]) == {"daqp", "osqp"}
+        assert set(one["rivals"]) == set(cbfpy_rival.backends())
+        assert sum(one["verdicts"].values()) == pytest.approx(1.0)
+        assert one["whole"]["p99"] is None, "20 samples tell none"
+    assert [one["sigma_m"] for one in results["flights"]] == [0.0, 0.0, 0.05, 0.05]
+    assert all(one["flights"][0]["clearance_m"] > 0.0 for one in results["flights"])
+    assert results["seeds"] == {"states": 90210, "flights": 7321}
+    assert told["figures"][0]["name"] == "10 obstacles, N = 5: p50 of the whole, ms"
+
+
+@pytest.mark.usefixtures("small_filter")
+def test_filter_without_rivals_says_how_to_get_them(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: None)
+    assert main(["bench", "filter", "--quick"]) == 0
+    told = capsys.readouterr()
+    for name in ("cbfpy", "quadprog"):
+        assert f"without {name}: pip install 'companion-safety[bench]'" in told.err
+        assert name not in told.out.replace("and cbfpy [ms]", "")
+    for text in ("whole", "ours (osqp)", "sign changes", "crossing", "figures"):
+        assert text in told.out
 
 
 @pytest.mark.slow

@@ -10,13 +10,13 @@ import pytest
 
 from companion.config import Config
 from companion.types import frozen
+from policies.evaluation.campaign import run
 from policies.evaluation.encounters import (
     Encounter,
     Obstacle,
     Sensor,
     fly,
     make_encounter,
-    run,
     stand_in_reference,
 )
 

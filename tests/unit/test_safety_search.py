@@ -11,10 +11,11 @@ import pytest
 from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
 from companion.safety import qp, search
+from companion.safety import task as task_module
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.safety.search import form, least_cost, least_of_ways, limit_rows
 from companion.safety.stopping import StopRows
-from companion.safety.task import Found, Task, judge
+from companion.safety.task import Found, Task, Ways, judge
 from companion.types import Prediction, Verdict, frozen
 
 ORDER = ("daqp", "osqp")
@@ -177,7 +178,7 @@ def test_answers_are_nearly_the_cheapest_of_a_dense_search(
     for seed in range(14):
         inputs = random_inputs(seed, 2, config)
         task = task_of(inputs, config)
-        found = least_of_ways(task, task.rows.balls(np.ones(2)), task.a_ref, ORDER)
+        found = least_of_ways(task, task.rows.balls(np.ones(2)), Ways(task, task.a_ref), ORDER)
         points = task.limits.clip(rng.uniform(-3.0, 3.0, (4000, 3)))
         for spread in (0.3, 0.1, 0.03, 0.01):
             ranked = judge(task, points).ranked
@@ -229,8 +230,8 @@ def test_a_small_correction_looks_for_no_other_way(monkeypatch: pytest.MonkeyPat
     config = SafetyConfig()
     task = task_of(random_inputs(0, 1, config, close=False), config)
     asked = []
-    monkeypatch.setattr(search, "candidates", lambda *_: asked.append(1))
-    found = least_of_ways(task, task.rows.balls(np.ones(1)), task.a_ref, ORDER)
+    monkeypatch.setattr(task_module, "candidates", lambda *_: asked.append(1))
+    found = least_of_ways(task, task.rows.balls(np.ones(1)), Ways(task, task.a_ref), ORDER)
     assert found.cost <= search.CHEAP
     assert not asked
 
@@ -252,7 +253,7 @@ def test_a_cheaper_way_round_is_taken() -> None:
     guard = SafetyFilter(config, LimitsConfig())
     inputs = FilterInput(np.array([0.0, 0.0, 5.0]), np.array([2.0, 0.0, 0.0]), np.zeros(3), prediction)
     task = guard.build(inputs)
-    found = least_of_ways(task, task.rows.balls(np.ones(1)), np.array([0.0, 3.0, 0.0]), ORDER)
+    found = least_of_ways(task, task.rows.balls(np.ones(1)), Ways(task, np.array([0.0, 3.0, 0.0])), ORDER)
     assert found.a[1] < 0.0  # the obstacle is to the left of the path
     assert guard.step(inputs).verdict is Verdict.ADJUSTED
 
@@ -457,24 +458,24 @@ def test_a_cheap_answer_keeps_its_way_and_a_dear_one_is_measured_against_the_bes
         return Found(start.a, start.epsilon, True, costs[name], 1, name)
 
     monkeypatch.setattr(search, "least_cost", fake)
-    assert least_of_ways(task, balls, last, ORDER).solver == "first"
+    assert least_of_ways(task, balls, Ways(task, last), ORDER).solver == "first"
     assert len(starts) == 1
     assert starts[0].a.tolist() == [3.0, 0.0, 0.0]  # the last answer, clipped
     assert starts[0].epsilon.tolist() == [2.0, 2.0]
     assert (starts[0].admissible, starts[0].cost, starts[0].iterations, starts[0].solver) == (False, np.inf, 0, "none")
-    ranked = judge(task, task.limits.clip(search.candidates(task))).ranked
+    ranked = judge(task, task.limits.clip(task_module.candidates(task))).ranked
     best = float(ranked.min())
     for first, other, taken in ((best + 1.0, 0.7, "other"), (best + 1.0, best + 2.0, "first")):
         starts.clear()
         costs.update(first=first, other=other)
-        assert least_of_ways(task, balls, away, ORDER).solver == taken
+        assert least_of_ways(task, balls, Ways(task, away), ORDER).solver == taken
         assert len(starts) == 2
-        assert starts[1].a.tolist() == task.limits.clip(search.candidates(task))[int(ranked.argmin())].tolist()
+        assert starts[1].a.tolist() == task.limits.clip(task_module.candidates(task))[int(ranked.argmin())].tolist()
         assert (starts[1].admissible, starts[1].cost, starts[1].iterations) == (True, pytest.approx(best), 0)
         assert starts[1].solver == "none"
         assert judge(task, starts[1].a[None]).upper[0] == pytest.approx(starts[1].epsilon)
     starts.clear()
     costs.update(first=0.5 * (best + search.CHEAP), other=0.0)
     assert best > search.CHEAP
-    assert least_of_ways(task, balls, away, ORDER).solver == "first"  # no candidate is cheaper
+    assert least_of_ways(task, balls, Ways(task, away), ORDER).solver == "first"  # no candidate is cheaper
     assert len(starts) == 1
