@@ -233,19 +233,21 @@ def test_margins_are_those_of_each_obstacle_at_its_own_step() -> None:
 
 def test_inside_the_keep_out_distance_there_is_a_least_decay() -> None:
     config = SafetyConfig(kappa=0.0, kappa_now=0.0, sigma_delay_s=0.0, recovery=0.07)
-    start = np.array([[0.45, 0.0, 0.0], [0.55, 0.0, 0.0]])
+    start = np.array([[0.45, 0.0, 0.0], [0.55, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    v = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.2, 0.0, 0.0]])  # the last is out of it after two steps
     prediction = Prediction(
         0,
         0.05,
-        ("in", "out"),
-        frozen(np.repeat(start[:, None], 23, axis=1)),
-        frozen(np.zeros((2, 23))),
-        frozen(np.zeros((2, 3))),
-        frozen(np.zeros((2, 3))),
-        frozen([0.2, 0.2]),
+        ("in", "out", "leaving"),
+        frozen(start[:, None] + 0.05 * np.arange(23)[:, None] * v[:, None]),
+        frozen(np.zeros((3, 23))),
+        frozen(v),
+        frozen(np.zeros((3, 3))),
+        frozen([0.2, 0.2, 0.2]),
     )
     rows = Barrier(config).rows(np.zeros(3), np.zeros(3), prediction, 0.0)
-    assert rows.least_decay.tolist() == [0.07, 0.0]
+    assert rows.least_decay.tolist() == [0.07, 0.0, 0.07]
+    assert rows.psi[0, 2, 1] > 0.0
     assert rows.psi[0, 0, 0] == pytest.approx(0.8 * 0.5 * (0.45**2 - 0.5**2))  # alpha1 h
 
 

@@ -386,7 +386,7 @@ def test_the_box_shrinks_and_grows_again_with_the_disturbance() -> None:
         assert guard.build(dataclasses.replace(inputs, accel_shrink_m_s2=shrink)).limits.box_m_s2 == 3.0 - shrink
 
 
-class Search:
+class Asked:
     """Stands for the search: records what it is asked, and answers as given."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, a: tuple[float, ...], *, admissible: bool = True) -> None:
@@ -394,11 +394,11 @@ class Search:
         self.violated: list[tuple[Task, np.ndarray, tuple[str, ...]]] = []
 
         def ways(task: Task, balls: Balls, ways: Ways, order: tuple[str, ...]) -> Found:
-            self.asked.append((task, balls, ways.last, order))
+            self.asked.append((task, balls, np.array(ways.last), order))
             return Found(np.array(a), np.full(len(task.rows), 0.9), admissible, 1.5, 3, "ways")
 
         def violation(task: Task, ways: Ways, order: tuple[str, ...]) -> Found:
-            self.violated.append((task, ways.last, order))
+            self.violated.append((task, np.array(ways.last), order))
             return Found(np.array(a), np.full(len(task.rows), 1.1), False, np.inf, 2, "violation")
 
         monkeypatch.setattr(filter_module, "least_of_ways", ways)
@@ -410,7 +410,7 @@ NEAR = [(2.0, 0.05, 2.0), (2.2, -0.3, 2.0)]
 
 def test_the_search_has_what_is_within_reach_and_the_last_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     prediction = straight([NEAR[0], (0.0, 9.0, 2.0), NEAR[1]], [(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)])
-    ways, guard = Search(monkeypatch, (-2.0, 1.0, 0.5)), SafetyFilter(SAFETY, LIMITS)
+    ways, guard = Asked(monkeypatch, (-2.0, 1.0, 0.5)), SafetyFilter(SAFETY, LIMITS)
     inputs = tick(prediction, a=(1.0, 0.2, 0.0))
     answer = guard.solve(guard.build(inputs), 0.05)
     task, balls, last, order = ways.asked[0]
@@ -441,7 +441,7 @@ def test_the_search_has_what_is_within_reach_and_the_last_answer(monkeypatch: py
 
 
 def test_the_least_violation_is_asked_where_no_way_is_admissible(monkeypatch: pytest.MonkeyPatch) -> None:
-    ways = Search(monkeypatch, (-2.0, 1.0, 0.5), admissible=False)
+    ways = Asked(monkeypatch, (-2.0, 1.0, 0.5), admissible=False)
     guard = SafetyFilter(SAFETY, LIMITS)
     inputs = tick(straight(NEAR, [(-1.0, 0.0, 0.0)] * 2))
     task = guard.build(inputs)
@@ -456,7 +456,7 @@ def test_the_least_violation_is_asked_where_no_way_is_admissible(monkeypatch: py
 
 
 def test_a_vehicle_at_an_obstacle_is_sent_round_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    ways, guard = Search(monkeypatch, (0.0, 0.0, 0.0)), SafetyFilter(SAFETY, LIMITS)
+    ways, guard = Asked(monkeypatch, (0.0, 0.0, 0.0)), SafetyFilter(SAFETY, LIMITS)
     inputs = tick(straight([(0.55, 0.0, 2.0)], [(0.0, 0.0, 0.0)]), v=(0.0, 0.0, 0.0), a=(2.0, 0.0, 0.0))
     guard.step(inputs)
     task, _, last, _ = ways.asked[0]
@@ -469,7 +469,7 @@ def test_a_stop_that_a_corner_of_the_box_breaks_is_within_reach(
     floor: float, asked: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No row of obstacles 9 m away may break; a corner of the box is sqrt(3) 3 m/s^2 = 5.196 m/s^2 out."""
-    ways, guard = Search(monkeypatch, (0.0, 0.0, 0.0)), SafetyFilter(SAFETY, LIMITS)
+    ways, guard = Asked(monkeypatch, (0.0, 0.0, 0.0)), SafetyFilter(SAFETY, LIMITS)
     prediction = straight([(9.0, 0.0, 2.0), (0.0, 9.0, 2.0)], [(0.0, 0.0, 0.0)] * 2)
     task = guard.build(tick(prediction, v=(0.0, 0.0, 0.0), a=(3.5, 0.0, 0.0)))
     stops = StopRows(np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([-np.inf, floor]))
@@ -482,7 +482,7 @@ def test_a_stop_that_a_corner_of_the_box_breaks_is_within_reach(
 
 
 def test_the_clf_budget_is_that_of_each_obstacles_own_history(monkeypatch: pytest.MonkeyPatch) -> None:
-    ways, guard = Search(monkeypatch, (-2.0, 1.0, 0.5)), SafetyFilter(SAFETY, LIMITS)
+    ways, guard = Asked(monkeypatch, (-2.0, 1.0, 0.5)), SafetyFilter(SAFETY, LIMITS)
     guard.step(tick(straight(NEAR[:1], [(-1.0, 0.0, 0.0)])))
     assert ways.asked[0][0].budget.tolist() == [4.0]  # without history from the greatest epsilon, 2
     guard.step(tick(straight(NEAR, [(-1.0, 0.0, 0.0)] * 2), elapsed_s=0.1))

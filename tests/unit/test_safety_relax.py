@@ -72,7 +72,8 @@ def test_the_widest_way_touches_nobody_first_and_then_gives_the_first_obstacle_i
     assert widest(np.array([[1.0, -0.5], [0.1, 0.0], [0.0, 1.0]])) == 1  # no contact before any margin
     assert widest(np.array([[0.5, 1.0], [0.8, 0.2], [0.8, 0.4]])) == 2
     assert widest(np.array([[-0.5, 1.0], [-0.2, -0.9]])) == 1  # the earlier contact counts more
-    assert widest(np.array([[0.50, 0.5], [0.51, 0.6]])) == 1  # the same to a twentieth: then the sum
+    assert widest(np.array([[0.50, 0.5], [0.51, 0.6]])) == 1
+    assert widest(np.array([[0.50, 0.5], [0.51, 0.51], [0.5, 0.5]])) == 1  # the same to a twentieth: then the sum
 
 
 def test_the_first_obstacle_keeps_what_it_can_and_the_second_what_is_left() -> None:
@@ -203,17 +204,6 @@ def hand_program(task: Task, a: np.ndarray, kept: np.ndarray, raised: list[int])
         rows.append(row)
         floors.append(floor)
 
-    for cone in task.limits.cones:  # kept
-        add(*cone.tangent(a))
-    add(*task.limits.speed.tangent(a), (7, 1.0))
-    assert task.stops is not None
-    for normal, floor in zip(task.stops.normal, task.stops.floor, strict=True):
-        if np.isfinite(floor):
-            add(normal, floor, (5, 1.0))
-    for axis in range(3):
-        add(np.eye(3)[axis], task.limits.arena_low[axis], (6, 1.0))
-    for axis in range(3):
-        add(-np.eye(3)[axis], -task.limits.arena_high[axis], (6, 1.0))
     barrier, last = task.rows, task.rows.keep_out_m.shape[1] - 1
 
     def tangent(j: int, i: int) -> tuple[np.ndarray, float, float]:
@@ -238,6 +228,17 @@ def hand_program(task: Task, a: np.ndarray, kept: np.ndarray, raised: list[int])
     for j in raised:
         normal, floor, margin = tangent(j, last)
         add(normal, floor, (4, -margin))
+    for cone in task.limits.cones:  # kept
+        add(*cone.tangent(a))
+    add(*task.limits.speed.tangent(a), (7, 1.0))
+    assert task.stops is not None
+    for normal, floor in zip(task.stops.normal, task.stops.floor, strict=True):
+        if np.isfinite(floor):
+            add(normal, floor, (5, 1.0))
+    for axis in range(3):
+        add(np.eye(3)[axis], task.limits.arena_low[axis], (6, 1.0))
+    for axis in range(3):
+        add(-np.eye(3)[axis], -task.limits.arena_high[axis], (6, 1.0))
     return np.array(rows), np.array(floors)
 
 
@@ -250,8 +251,10 @@ def crowded() -> Task:
         a_ref=(0.5, -0.3, 0.2),
         before=(0.4, 0.1, 0.0),
     )
-    prediction = dataclasses.replace(inputs.prediction, radius_m=frozen([0.2, 0.3, 2.5]))
-    return task_of(dataclasses.replace(inputs, prediction=prediction), SLEWED)
+    sigma = frozen(np.outer((0.1, 0.2, 0.3), T))
+    prediction = dataclasses.replace(inputs.prediction, radius_m=frozen([0.2, 0.3, 2.5]), sigma_m=sigma)
+    config = msgspec.structs.replace(SAFETY, kappa=1.0, sigma_growth_s=9.0)
+    return task_of(dataclasses.replace(inputs, prediction=prediction), SLEWED, config)
 
 
 @pytest.mark.parametrize("raised", [[1], [2, 0]])
@@ -417,3 +420,52 @@ def test_the_last_way_is_not_kept_where_it_touches_and_another_does_not(monkeypa
     ways = Ways(task, np.array([1.0, 1.0, 1.0]))
     least_violation(task, ways, ("daqp",))
     assert programs.asked[0][0].tolist() == task.limits.clip_hard(ways.offered)[7].tolist()
+
+
+@pytest.mark.parametrize(
+    ("last", "other", "kept"),
+    [
+        ((0.9, 0.2), (1.0, 0.9), True),  # 1.05 in the first place
+        ((0.8, 0.9), (1.0, 0.2), False),
+        ((1.0, 0.2), (1.0, 0.9), False),  # all of the margin is not favoured: the second obstacle decides
+    ],
+)
+def test_the_last_way_is_favoured_where_it_leaves_less_than_the_margin(
+    last: tuple[float, float], other: tuple[float, float], kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = task_of(inputs_of([(1.4, 0.0, 0.0), (2.0, 0.1, 0.0)], [(-0.5, 0.0, 0.0)] * 2))
+    ways = Ways(task, np.array([1.0, 2.0, 3.0]))
+    offered = np.full((len(ways.offered), 2), -1.0)
+    offered[0], offered[7] = last, other
+    monkeypatch.setattr(relax, "shares", lambda *_: offered.copy())
+    programs = Programs(monkeypatch, [(0.0, 0.0, 0.0, 0.5, 0.5)] * 9)
+    least_violation(task, ways, ("daqp",))
+    assert programs.asked[0][0].tolist() == ways.offered[0 if kept else 7].tolist()
+    assert programs.asked[0][1][:, 0].tolist() == [-1e-6, -1e-6]
+
+
+def test_an_epsilon_is_none_where_no_decay_serves() -> None:
+    """Inside the margin and further in at 1 m/s: even the least decay is more than the rows leave."""
+    task = task_of(inputs_of([(0.45, 0.0, 0.0)], [(0.0, 0.0, 0.0)], speed=(1.0, 0.0, 0.0)))
+    found = least_violation(task, Ways(task, np.zeros(3)), ("daqp",))
+    lower, upper = decay_interval(task.rows.evaluate(found.a), task.rows.least_decay)
+    assert lower[0] + upper[0] < 0.0
+    assert found.epsilon.tolist() == [0.0]
+
+
+def test_braking_takes_the_widest_where_nothing_is_admissible() -> None:
+    task = task_of(inputs_of([(1.05, 0.25, 0.0)], [(0.0, 0.0, 0.0)]))
+    ways = Ways(task, np.zeros(3))
+    found = braking(task, ways)
+    offered = shares(task.rows, task.limits.clip(ways.offered))[:, 0]
+    assert not found.admissible
+    assert shares(task.rows, found.a[None])[0, 0] == pytest.approx(offered.max())
+    assert 0.5 < offered.max() < 0.7
+    assert np.sort(offered)[-3] < offered.max() - 0.2
+
+
+def test_brakings_epsilon_has_all_of_its_range() -> None:
+    task = dataclasses.replace(
+        task_of(inputs_of([(4.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)], speed=(1.0, 0.0, 0.0))), star=np.array([1.7])
+    )
+    assert braking(task, Ways(task, np.zeros(3))).epsilon.tolist() == [1.7]

@@ -463,14 +463,14 @@ def test_a_cheap_answer_keeps_its_way_and_a_dear_one_is_measured_against_the_bes
     assert starts[0].a.tolist() == [3.0, 0.0, 0.0]  # the last answer, clipped
     assert starts[0].epsilon.tolist() == [2.0, 2.0]
     assert (starts[0].admissible, starts[0].cost, starts[0].iterations, starts[0].solver) == (False, np.inf, 0, "none")
-    ranked = judge(task, task.limits.clip(Ways(task, away).offered)).ranked
+    ranked = judge(task, task.limits.clip(task_module.candidates(task))).ranked
     best = float(ranked.min())
     for first, other, taken in ((best + 1.0, 0.7, "other"), (best + 1.0, best + 2.0, "first")):
         starts.clear()
         costs.update(first=first, other=other)
         assert least_of_ways(task, balls, Ways(task, away), ORDER).solver == taken
         assert len(starts) == 2
-        assert starts[1].a.tolist() == task.limits.clip(Ways(task, away).offered)[int(ranked.argmin())].tolist()
+        assert starts[1].a.tolist() == task.limits.clip(task_module.candidates(task))[int(ranked.argmin())].tolist()
         assert (starts[1].admissible, starts[1].cost, starts[1].iterations) == (True, pytest.approx(best), 0)
         assert starts[1].solver == "none"
         assert judge(task, starts[1].a[None]).upper[0] == pytest.approx(starts[1].epsilon)
