@@ -204,6 +204,17 @@ def hand_program(task: Task, a: np.ndarray, kept: np.ndarray, raised: list[int])
         rows.append(row)
         floors.append(floor)
 
+    for cone in task.limits.cones:  # kept
+        add(*cone.tangent(a))
+    add(*task.limits.speed.tangent(a), (7, 1.0))
+    assert task.stops is not None
+    for normal, floor in zip(task.stops.normal, task.stops.floor, strict=True):
+        if np.isfinite(floor):
+            add(normal, floor, (5, 1.0))
+    for axis in range(3):
+        add(np.eye(3)[axis], task.limits.arena_low[axis], (6, 1.0))
+    for axis in range(3):
+        add(-np.eye(3)[axis], -task.limits.arena_high[axis], (6, 1.0))
     barrier, last = task.rows, task.rows.keep_out_m.shape[1] - 1
 
     def tangent(j: int, i: int) -> tuple[np.ndarray, float, float]:
@@ -228,17 +239,6 @@ def hand_program(task: Task, a: np.ndarray, kept: np.ndarray, raised: list[int])
     for j in raised:
         normal, floor, margin = tangent(j, last)
         add(normal, floor, (4, -margin))
-    for cone in task.limits.cones:  # kept
-        add(*cone.tangent(a))
-    add(*task.limits.speed.tangent(a), (7, 1.0))
-    assert task.stops is not None
-    for normal, floor in zip(task.stops.normal, task.stops.floor, strict=True):
-        if np.isfinite(floor):
-            add(normal, floor, (5, 1.0))
-    for axis in range(3):
-        add(np.eye(3)[axis], task.limits.arena_low[axis], (6, 1.0))
-    for axis in range(3):
-        add(-np.eye(3)[axis], -task.limits.arena_high[axis], (6, 1.0))
     return np.array(rows), np.array(floors)
 
 
