@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -167,6 +168,7 @@ def _encounters(args: argparse.Namespace) -> int:
     config = load_config(args.config) if args.config else Config()
     sensor = Sensor(noise_std_m=args.noise, latency_s=args.latency, dropout=args.dropout)
     seeds = range(args.seed, args.seed + args.flights)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # or the workers would fly on
     with encounters_display(args.flights) as show:
         outcomes = fly_all(seeds, args.obstacles, config, sensor, jobs=args.jobs, on_outcome=show)
     figures = report(outcomes).to_json()
@@ -184,3 +186,7 @@ def _print(values: dict[str, Any], as_json: bool) -> None:
     for key, value in flat.items():
         shown = [round(x, 4) for x in value] if isinstance(value, list) else value
         print(f"{key:34s} {round(shown, 4) if isinstance(shown, float) else shown}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
