@@ -577,3 +577,21 @@ def test_a_reference_at_the_very_stop_passes() -> None:
     nominal = guard.solve(task, 0.05)
     assert (nominal.found.admissible, nominal.found.cost, nominal.found.iterations) == (True, 0.0, 0)
     assert nominal.found.solver == "none"
+
+
+def test_with_a_slew_limit_less_can_be_swerved_round() -> None:
+    """At 5 m/s^3 3 m/s^2 take 0.6 s: within 1.075 s 0.18 + 0.9 * 0.475 + 1.5 * 0.475^2 = 0.946 m, not 1.733 m."""
+    config, prediction = msgspec.structs.replace(SAFETY, kappa=0.0), straight([(9.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)])
+    for radius, stops in ((0.64, False), (0.66, True)):
+        inputs = tick(dataclasses.replace(prediction, radius_m=frozen([radius])))
+        assert (SafetyFilter(config, LimitsConfig(slew_m_s3=5.0)).build(inputs).stops is not None) == stops
+
+
+def test_a_stop_is_before_the_first_rows_keep_out_distance() -> None:
+    """Sigma grows along the horizon: D is 2.3 m at first and more after it."""
+    config = msgspec.structs.replace(SAFETY, kappa=1.0)
+    prediction = straight([(9.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)], radius=2.0)
+    prediction = dataclasses.replace(prediction, sigma_m=frozen(np.maximum(0.05 * np.arange(23) - 0.1, 0.0)[None]))
+    task = SafetyFilter(config, LIMITS).build(tick(prediction, v=(0.0, 0.0, 0.0)))
+    assert task.stops is not None
+    assert task.stops.floor[0] == pytest.approx(-capability(LIMITS, shrink_m_s2=0.0, dt_s=0.05).braking.bound(6.7, 0.0))

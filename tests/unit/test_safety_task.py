@@ -303,3 +303,9 @@ def test_standing_is_within_the_first_rows_keep_out_distance() -> None:
     rows = Barrier(SafetyConfig(kappa=1.0, sigma_delay_s=0.0)).rows(ORIGIN, np.zeros(3), prediction, 0.0)
     assert rows.keep_out_m[0, :2] == pytest.approx([0.5, 0.55])
     assert turned(rows, np.array([2.0, 0.0, 0.0])).tolist() == [2.0, 0.0, 0.0]
+
+
+def test_what_is_near_and_what_is_ahead_must_be_one() -> None:
+    """Near on the right is one past which the vehicle is sent, ahead is one that is far."""
+    rows = rows_of([(0.0, -0.6, 0.0), (2.0, 0.0, 0.0)], [STILL] * 2)
+    assert turned(rows, np.array([2.0, 0.0, 0.0])).tolist() == [2.0, 0.0, 0.0]
