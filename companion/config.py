@@ -131,8 +131,8 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     lambda_delta: Positive = 0.01
     drone_radius_m: Positive = 0.2
     cushion_m: NonNegative = 0.1
-    kappa: NonNegative = 1.5
-    kappa_now: NonNegative = 2.5  # of the present sigma, on top: every tick has that error, a prediction is corrected
+    kappa: NonNegative = 2.0
+    kappa_now: NonNegative = 1.0  # of the present sigma, on top: every tick has that error, a prediction is corrected
     sigma_growth_s: NonNegative = 0.7  # predicted sigma counts up to this far ahead; the next looks correct the rest
     sigma_cap_m: Positive = 2.0  # kappa sigma counts no further than this: a track just born is no wall
     sigma_delay_s: NonNegative = 0.01
