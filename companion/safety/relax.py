@@ -179,9 +179,9 @@ def braking(task: Task, ways: Ways) -> Found:
     starts = limits.clip(np.concatenate((stop[None], ways.offered)))
     judgement = judge(task, starts)
     least = np.minimum.reduce(shares(task.rows, starts), axis=-1, initial=1.0)
-    share = np.where(judgement.admissible, 1.0, np.minimum(least, 1.0 - 1e-9))
+    share = np.where(judgement.admissible, 1.0, least)
     v_next = limits.v_enu + starts * dt_s
-    order = np.lexsort((np.vecdot(v_next, v_next), -np.round(share, 3)))
+    order = np.lexsort((np.vecdot(v_next, v_next), -np.round(share, 3), ~judgement.admissible))
     best = int(order[0])
     epsilon = np.clip(np.maximum(task.star, judgement.lower[best]), 0.0, 1.0 / task.config.alpha2)
     return Found(starts[best], epsilon, bool(judgement.admissible[best]), np.inf, 0, "none")

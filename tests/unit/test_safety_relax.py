@@ -469,3 +469,19 @@ def test_brakings_epsilon_has_all_of_its_range() -> None:
         task_of(inputs_of([(4.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)], speed=(1.0, 0.0, 0.0))), star=np.array([1.7])
     )
     assert braking(task, Ways(task, np.zeros(3))).epsilon.tolist() == [1.7]
+
+
+def test_braking_prefers_the_admissible_to_the_slower(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both leave the whole margin; the slower breaks a row."""
+    task = task_of(inputs_of([(6.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)], speed=(1.0, 0.0, 0.0)))
+    real = relax.judge
+
+    def judged(task: Task, a: np.ndarray) -> object:
+        verdict = real(task, a)
+        return dataclasses.replace(verdict, admissible=np.arange(len(a)) == 5)
+
+    monkeypatch.setattr(relax, "judge", judged)
+    ways = Ways(task, np.zeros(3))
+    found = braking(task, ways)
+    assert found.admissible
+    assert found.a.tolist() == task.limits.clip(ways.offered)[4].tolist()
