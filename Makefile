@@ -48,7 +48,7 @@ coverage: $(VENV)/dev.stamp  ## every branch of the safety layer and the pilot i
 # one thread each: two mutants run beside one another, and a result must not depend on the number of cores
 mutants: export OMP_NUM_THREADS = 1
 mutants: export OPENBLAS_NUM_THREADS = 1
-mutants: $(VENV)/dev.stamp  ## mutation tests of the safety layer (a quarter of an hour): at least 90 % must be killed
+mutants: $(VENV)/dev.stamp  ## mutation tests of the safety layer: at least 90 % must be killed
 	rm -rf mutants
 	$(BIN)/mutmut run --max-children 2
 	$(BIN)/python tests/mutation/report.py

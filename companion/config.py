@@ -204,6 +204,12 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return self.profile.actuation_lag_s if self.delay.actuation_s is None else self.delay.actuation_s
 
     @property
+    def reference_limit_m_s2(self) -> float:
+        """The acceleration limit of each axis less what the disturbance estimate may add on the wire."""
+        reserve = self.disturbance.bound_m_s2 if self.disturbance.enabled else 0.0
+        return self.limits.acceleration_m_s2 - reserve
+
+    @property
     def prefix(self) -> str:
         return f"uav/{self.vehicle.name}"
 

@@ -199,7 +199,7 @@ class Pilot:
         """The reference acceleration, and whether the policy's output was usable."""
         if inputs.task is not self._task:
             self._task, self._anchor = inputs.task, None
-        config, limit = self._config.policy, self._reserve_limit()
+        config, limit = self._config.policy, self._config.reference_limit_m_s2
         p, v = inputs.vehicle.p_enu, inputs.vehicle.v_enu
         if inputs.task is Task.STAY:
             return frozen(brake(v_act, config, limit)), True
@@ -246,16 +246,11 @@ class Pilot:
                 prediction=prediction,
                 p_std_m=vehicle.p_std_m,
                 limits_on=flying,
-                accel_shrink_m_s2=full - self._reserve_limit(),
+                accel_shrink_m_s2=full - self._config.reference_limit_m_s2,
                 elapsed_s=elapsed_s,
                 a_before=self._commands[-1][1] if self._commands else None,
             )
         )
-
-    def _reserve_limit(self) -> float:
-        """The acceleration limit less what the disturbance estimate may add on the wire [m/s^2]."""
-        reserve = self._config.disturbance.bound_m_s2 if self._config.disturbance.enabled else 0.0
-        return self._config.limits.acceleration_m_s2 - reserve
 
     def _saturated(self, wire: Vec3) -> bool:
         return bool(np.abs(wire).max() >= self._config.limits.acceleration_m_s2 - 1e-9)

@@ -49,31 +49,35 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parts = bench.add_subparsers(dest="part", required=True, metavar="PART")
-    tracking = parts.add_parser(
-        "tracking",
-        help="the tracker: accuracy, covariance, identity, time",
-        description=_TRACKING,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    tracking = _add_part(parts, "tracking", _tracking, "the tracker: accuracy, covariance, identity, time", _TRACKING)
     depth = tracking.add_mutually_exclusive_group()
     depth.add_argument("--quick", action="store_true", help="the headline conditions only, on four trials a motion")
     depth.add_argument("--all", action="store_true", help="every combination of noise, rate, dropout and latency")
     depth.add_argument(
         "--tune-rivals", action="store_true", help="instead: search the rivals' process noises on the tuning seed"
     )
-    tracking.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else there")
-    tracking.set_defaults(handler=_tracking)
-    safety = parts.add_parser(
-        "filter",
-        help="the safety filter: time where it acts, solvers, chatter",
-        description=_FILTER,
+    safety = _add_part(parts, "filter", _filter, "the safety filter: time where it acts, solvers, chatter", _FILTER)
+    safety.add_argument("--quick", action="store_true", help="the conditions with figures only, on fewer states")
+
+
+def _add_part(
+    parts: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    handler: Callable[[argparse.Namespace], int],
+    told: str,
+    description: str,
+) -> argparse.ArgumentParser:
+    """A subcommand with what all of them have."""
+    part = parts.add_parser(
+        name,
+        help=told,
+        description=description,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    safety.add_argument("--quick", action="store_true", help="the conditions with figures only, on fewer states")
-    safety.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else there")
-    safety.set_defaults(handler=_filter)
+    part.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else there")
+    part.set_defaults(handler=handler)
+    return part
 
 
 def _tracking(arguments: argparse.Namespace) -> int:

@@ -30,14 +30,13 @@ from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
 from companion.safety.adapt import clf_budget, decay_interval, epsilon_star
 from companion.safety.barrier import Barrier
-from companion.safety.limits import Capability, capability, vehicle_limits
+from companion.safety.limits import DIAGONAL, Capability, capability, vehicle_limits
 from companion.safety.relax import braking, least_violation
 from companion.safety.search import least_of_ways
 from companion.safety.stopping import StopRows, stop_rows, swerve_m
 from companion.safety.task import Found, Task, Ways, turned
 from companion.types import FilterResult, FloatArray, Prediction, RowRecord, Vec3, Verdict, frozen
 
-_DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
 LIMIT_LISTED_M_S2 = 0.05  # a vehicle limit with less room than this is listed with the answer
 _OTHER = {"daqp": ("daqp", "osqp"), "osqp": ("osqp", "daqp")}
 
@@ -145,7 +144,7 @@ class SafetyFilter:
         balls = task.rows.balls(np.ones(len(task.rows)))
         near = balls.reachable(task.limits.hard_low, task.limits.hard_high)
         if task.stops is not None:
-            near |= task.stops.floor > -_DIAGONAL * task.limits.box_m_s2
+            near |= task.stops.floor > -DIAGONAL * task.limits.box_m_s2
         taken = near.nonzero()[0]
         reduced = task
         if len(taken) < len(near):

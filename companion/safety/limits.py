@@ -23,7 +23,7 @@ from companion.types import FloatArray, Vec3
 
 BRAKING_SHARE = 0.7  # of the acceleration in every direction, counted on for stopping at a wall
 ROUNDING_M_S2 = 1e-9  # a reference clipped to the same box by someone else may differ in the last bits
-_DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
+DIAGONAL = math.sqrt(3.0)  # of a cube of half-side 1, from its centre
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ def capability(config: LimitsConfig, *, shrink_m_s2: float, dt_s: float) -> Capa
     corners = box * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
     binding = tuple(cone for cone in cones if cone.excess(corners).max() > 0.0)
     authority = min(box, *(cone.reach for cone in binding)) if binding else box
-    share = min(BRAKING_SHARE, 1.0 / _DIAGONAL) if binding else BRAKING_SHARE
+    share = min(BRAKING_SHARE, 1.0 / DIAGONAL) if binding else BRAKING_SHARE
     return Capability(box, Braking(share * authority, dt_s, config.slew_m_s3), authority, binding)
 
 
@@ -163,7 +163,7 @@ def vehicle_limits(
         arena_high=bounds[5],
         v_enu=v_enu,
         speed=speed_cone(v_enu, bound, ahead_s),
-        may_speed=speed + _DIAGONAL * box * ahead_s > bound,
+        may_speed=speed + DIAGONAL * box * ahead_s > bound,
         cones=can.cones,
         inside=centre,
     )

@@ -1,8 +1,8 @@
 """Where no acceleration keeps every row: the least violation, lexicographic, and without any solver: braking.
 
 What counts first is that nobody is touched, obstacle by obstacle in the order of the time to contact; then their
-margins in the same order; then the arena; then speed; then the reference. Box, slew, norm and tilt are kept by all of
-it: the vehicle cannot leave them.
+margins in the same order; then braking distances, the arena and speed; then the reference. Box, slew, norm and tilt
+are kept by all of it: the vehicle cannot leave them.
 
 The violation is measured by the share t <= 1 of the margin beyond the bare radii that an obstacle is left over the
 horizon, |r_k(a)| >= R + t (D - R): 1 is all of D, 0 is contact. Row values in m/s^2 would rank the first steps of the

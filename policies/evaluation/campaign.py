@@ -24,7 +24,7 @@ from companion.config import Config
 from companion.errors import CompanionError
 from companion.policy import load_policy
 from companion.types import Vec3
-from policies.evaluation.encounters import Outcome, Reference, Sensor, outcome_of, reserve_limit
+from policies.evaluation.encounters import Outcome, Reference, Sensor, outcome_of
 from policies.evaluation.statistics import wilson
 
 CHUNKS_PER_JOB = 8
@@ -89,7 +89,7 @@ def shipped_reference(config: Config) -> Reference:
     Raises:
         ArtifactError: the policy cannot be flown with this configuration.
     """
-    policy, limit = load_policy(config.policy, config.limits), reserve_limit(config)
+    policy, limit = load_policy(config.policy, config.limits), config.reference_limit_m_s2
 
     def act(v_enu: Vec3, e_enu: Vec3) -> Vec3:
         return np.clip(policy.act(v_enu, e_enu), -limit, limit)

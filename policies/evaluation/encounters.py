@@ -94,12 +94,6 @@ class Outcome:
     ticks: int
 
 
-def reserve_limit(config: Config) -> float:
-    """The acceleration limit less the disturbance reserve, as the pilot counts it [m/s^2]."""
-    reserve = config.disturbance.bound_m_s2 if config.disturbance.enabled else 0.0
-    return config.limits.acceleration_m_s2 - reserve
-
-
 def stand_in_reference(limit_m_s2: float, speed_m_s: float) -> Reference:
     """A nearly time-optimal reference: the speed from which 0.6 of the limit still stops, chased at 3 / s."""
     braking = 0.6 * limit_m_s2
@@ -129,7 +123,7 @@ class _Loop:
         self._delay_ticks = round(config.actuation_s / TICK_S)
         for step in range(-round(WARM_UP_S / TICK_S), 0):
             self._tracker.update(tuple(self._frames(step, encounter.obstacles)), step * round(TICK_S * NS_PER_S))
-        self._shrink_m_s2 = config.limits.acceleration_m_s2 - reserve_limit(config)
+        self._shrink_m_s2 = config.limits.acceleration_m_s2 - config.reference_limit_m_s2
         self._before: Vec3 | None = None  # the last command; none before the first, as in the pilot
         self._commands: deque[Vec3] = deque([np.zeros(3)] * self._delay_ticks, maxlen=max(self._delay_ticks, 1))
 

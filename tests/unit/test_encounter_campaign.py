@@ -12,7 +12,7 @@ from companion.config import Config, DisturbanceConfig
 from companion.policy import load_policy
 from policies.cli import main
 from policies.evaluation.campaign import fly_all, report, shipped_reference
-from policies.evaluation.encounters import Outcome, Sensor, reserve_limit
+from policies.evaluation.encounters import Outcome, Sensor
 from policies.evaluation.statistics import wilson
 
 
@@ -55,7 +55,8 @@ def test_the_reference_keeps_the_disturbance_reserve() -> None:
     policy = load_policy(config.policy, config.limits)
     assert np.abs(policy.act(v, e)).max() > limit
     np.testing.assert_array_equal(shipped_reference(config)(v, e), np.clip(policy.act(v, e), -limit, limit))
-    assert reserve_limit(Config(disturbance=DisturbanceConfig(enabled=False))) == config.limits.acceleration_m_s2
+    unreserved = Config(disturbance=DisturbanceConfig(enabled=False))
+    assert unreserved.reference_limit_m_s2 == config.limits.acceleration_m_s2
 
 
 def test_one_process_and_two_fly_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

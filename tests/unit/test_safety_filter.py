@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 
 import msgspec
 import numpy as np
 import pytest
+from safety_scenes import uniform_motion
 
 from companion.config import LimitsConfig, SafetyConfig, parse_config
 from companion.errors import SolverError
@@ -26,27 +28,7 @@ SAFETY = SafetyConfig(sigma_delay_s=0.0)
 LIMITS = LimitsConfig()
 
 
-def straight(
-    p: list[tuple[float, ...]],
-    v: list[tuple[float, ...]],
-    *,
-    sigma: float = 0.0,
-    radius: float = 0.2,
-    horizon: int = 20,
-) -> Prediction:
-    """Obstacles in uniform motion, known exactly."""
-    count, t = len(p), 0.05 * np.arange(horizon + 3)
-    start, velocity = np.reshape(p, (count, 3)), np.reshape(v, (count, 3))
-    return Prediction(
-        start_ns=0,
-        dt_s=0.05,
-        ids=tuple(f"s/{index}" for index in range(count)),
-        p_enu=frozen(start[:, None] + t[:, None] * velocity[:, None]),
-        sigma_m=frozen(np.full((count, len(t)), sigma)),
-        v_enu=frozen(velocity),
-        a_enu=frozen(np.zeros((count, 3))),
-        radius_m=frozen(np.full(count, radius)),
-    )
+straight = partial(uniform_motion, prefix="s/")
 
 
 def tick(
@@ -338,7 +320,7 @@ def test_the_problem_is_built_of_rows_limits_target_and_stops() -> None:
     config = msgspec.structs.replace(SAFETY, sigma_delay_s=0.02)
     limits = LimitsConfig(slew_m_s3=10.0, norm_m_s2=2.0)
     prediction = straight(
-        [(3.0, 0.5, 2.0), (-2.0, 0.0, 2.5)], [(-1.0, 0.0, 0.0), (-3.0, 0.2, 0.0)], sigma=0.05, radius=0.9
+        [(3.0, 0.5, 2.0), (-2.0, 0.0, 2.5)], [(-1.0, 0.0, 0.0), (-3.0, 0.2, 0.0)], sigma_m=0.05, radius_m=0.9
     )
     inputs = FilterInput(
         np.array([9.0, 0.0, 2.0]),
@@ -376,7 +358,7 @@ def test_the_problem_is_built_of_rows_limits_target_and_stops() -> None:
 def test_what_can_be_swerved_round_within_the_horizon_has_no_stop(radius: float, stops: bool) -> None:
     """3 m/s^2 for 0.05 s sqrt(22 * 21) = 1.075 s are 1.733 m, and D is the radius and 0.3 m."""
     config = msgspec.structs.replace(SAFETY, kappa=0.0)
-    task = SafetyFilter(config, LIMITS).build(tick(straight([(9.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)], radius=radius)))
+    task = SafetyFilter(config, LIMITS).build(tick(straight([(9.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)], radius_m=radius)))
     assert (task.stops is not None) == stops
 
 
@@ -498,7 +480,7 @@ def judged(task: Task, a: tuple[float, ...], epsilon: np.ndarray, verdict: Verdi
 
 def test_the_record_names_of_each_obstacle_its_worst_row() -> None:
     guard = SafetyFilter(SAFETY, LIMITS)
-    task = guard.build(tick(straight(NEAR, [(-1.0, 0.0, 0.0), (0.5, 0.0, 0.0)], sigma=0.02), p=(0.0, 0.0, 2.0)))
+    task = guard.build(tick(straight(NEAR, [(-1.0, 0.0, 0.0), (0.5, 0.0, 0.0)], sigma_m=0.02), p=(0.0, 0.0, 2.0)))
     epsilon = np.array([1.2, 0.7])
     result = judged(task, (-1.0, 0.5, 0.2), epsilon, Verdict.ADJUSTED)
     assert [record.track for record in result.rows] == ["s/0", "s/1"]
@@ -590,7 +572,7 @@ def test_with_a_slew_limit_less_can_be_swerved_round() -> None:
 def test_a_stop_is_before_the_first_rows_keep_out_distance() -> None:
     """Sigma grows along the horizon: D is 2.3 m at first and more after it."""
     config = msgspec.structs.replace(SAFETY, kappa=1.0)
-    prediction = straight([(9.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)], radius=2.0)
+    prediction = straight([(9.0, 0.0, 2.0)], [(0.0, 0.0, 0.0)], radius_m=2.0)
     prediction = dataclasses.replace(prediction, sigma_m=frozen(np.maximum(0.05 * np.arange(23) - 0.1, 0.0)[None]))
     task = SafetyFilter(config, LIMITS).build(tick(prediction, v=(0.0, 0.0, 0.0)))
     assert task.stops is not None

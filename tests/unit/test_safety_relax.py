@@ -7,6 +7,7 @@ import dataclasses
 import msgspec
 import numpy as np
 import pytest
+from safety_scenes import uniform_motion
 
 from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
@@ -15,7 +16,7 @@ from companion.safety.adapt import decay_interval
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.safety.relax import braking, by_contact, least_violation, shares, widest
 from companion.safety.task import Task, Ways
-from companion.types import Prediction, Verdict, frozen
+from companion.types import Verdict, frozen
 
 SAFETY = SafetyConfig(sigma_delay_s=0.0, kappa=0.0)
 T = 0.05 * np.arange(23)
@@ -31,17 +32,7 @@ def inputs_of(
     radius: float = 0.2,
     before: tuple[float, ...] | None = None,
 ) -> FilterInput:
-    start, velocity = np.reshape(p, (len(p), 3)) + np.array(at), np.reshape(v, (len(p), 3))
-    prediction = Prediction(
-        start_ns=0,
-        dt_s=0.05,
-        ids=tuple(str(index) for index in range(len(p))),
-        p_enu=frozen(start[:, None] + T[:, None] * velocity[:, None]),
-        sigma_m=frozen(np.zeros((len(p), 23))),
-        v_enu=frozen(velocity),
-        a_enu=frozen(np.zeros((len(p), 3))),
-        radius_m=frozen(np.full(len(p), radius)),
-    )
+    prediction = uniform_motion(np.reshape(p, (-1, 3)) + np.array(at), v, radius_m=radius)
     last = None if before is None else np.array(before)
     return FilterInput(np.array(at), np.array(speed), np.array(a_ref), prediction, elapsed_s=0.05, a_before=last)
 

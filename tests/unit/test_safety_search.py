@@ -7,6 +7,7 @@ import dataclasses
 import msgspec
 import numpy as np
 import pytest
+from safety_scenes import uniform_motion
 
 from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
@@ -55,15 +56,20 @@ def value(task: Task, a: np.ndarray, epsilon: np.ndarray) -> np.ndarray:
     return np.asarray(rise + task.config.alpha2 * epsilon[:, None] * psi)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_a_touching_plane_admits_nothing_that_its_row_refuses(seed: int) -> None:
+def random_program(seed: int) -> tuple[Task, np.ndarray, np.ndarray, qp.Program]:
+    """Two obstacles, nine rows each: the task, the acceleration and epsilon that a program is about, and itself."""
     config = SafetyConfig(horizon=8)
     task = task_of(random_inputs(seed, 2, config), config)
     rng = np.random.default_rng(seed)
     a, epsilon = rng.uniform(-3.0, 3.0, 3), rng.uniform(0.4, 2.0, 2)
     shared = form(task, task.rows.balls(np.ones(2)))
-    program = search._tangent_program(task, shared, a, epsilon, epsilon)
-    count = 2 * 9
+    return task, a, epsilon, search._tangent_program(task, shared, a, epsilon, epsilon)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_touching_plane_admits_nothing_that_its_row_refuses(seed: int) -> None:
+    task, _, epsilon, program = random_program(seed)
+    count, rng = 2 * 9, np.random.default_rng(seed)
     points = rng.uniform(-3.0, 3.0, (300, 3))
     at_epsilon = np.concatenate((points, np.tile(epsilon, (300, 1)), np.zeros((300, 2))), axis=1)
     admitted = at_epsilon @ program.rows[:count].T >= program.floor[:count]
@@ -75,12 +81,8 @@ def test_a_touching_plane_admits_nothing_that_its_row_refuses(seed: int) -> None
 @pytest.mark.parametrize("seed", range(6))
 def test_planes_touch_their_balls_and_their_slopes_are_the_jacobian(seed: int) -> None:
     """Where a plane touches, the row is zero, and its finite differences in a and epsilon are the plane's, scaled."""
-    config = SafetyConfig(horizon=8)
-    task = task_of(random_inputs(seed, 2, config), config)
-    rng = np.random.default_rng(seed)
-    a, epsilon = rng.uniform(-3.0, 3.0, 3), rng.uniform(0.4, 2.0, 2)
-    balls = task.rows.balls(config.alpha2 * epsilon)
-    program = search._tangent_program(task, form(task, task.rows.balls(np.ones(2))), a, epsilon, epsilon)
+    task, a, epsilon, program = random_program(seed)
+    balls = task.rows.balls(task.config.alpha2 * epsilon)
     checked = 0
     for j in range(2):
         for i in range(9):
@@ -239,17 +241,7 @@ def test_a_small_correction_looks_for_no_other_way(monkeypatch: pytest.MonkeyPat
 def test_a_cheaper_way_round_is_taken() -> None:
     """From the costly side of an obstacle, with the last answer there."""
     config = msgspec.structs.replace(SafetyConfig(), kappa=0.0)
-    t = 0.05 * np.arange(23)
-    prediction = Prediction(
-        start_ns=0,
-        dt_s=0.05,
-        ids=("0",),
-        p_enu=frozen((np.array([2.0, 0.35, 5.0]) + t[:, None] * np.array([-1.0, 0.0, 0.0]))[None]),
-        sigma_m=frozen(np.zeros((1, 23))),
-        v_enu=frozen([[-1.0, 0.0, 0.0]]),
-        a_enu=frozen(np.zeros((1, 3))),
-        radius_m=frozen([0.2]),
-    )
+    prediction = uniform_motion([2.0, 0.35, 5.0], [-1.0, 0.0, 0.0])
     guard = SafetyFilter(config, LimitsConfig())
     inputs = FilterInput(np.array([0.0, 0.0, 5.0]), np.array([2.0, 0.0, 0.0]), np.zeros(3), prediction)
     task = guard.build(inputs)

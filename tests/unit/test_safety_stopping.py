@@ -6,11 +6,12 @@ import math
 
 import numpy as np
 import pytest
+from safety_scenes import uniform_motion
 
 from companion.config import LimitsConfig, SafetyConfig
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.safety.stopping import Braking, StopRows, stop_rows, swerve_m
-from companion.types import Prediction, Verdict, frozen
+from companion.types import Verdict
 
 DT = 0.05
 
@@ -87,7 +88,7 @@ def test_with_a_slew_limit_no_push_passes_a_wall(slew: float, tick_s: float) -> 
     limits = LimitsConfig(slew_m_s3=slew, arena_min=(-4.0, -4.0, 0.3), arena_max=(4.0, 4.0, 5.0))
     guard, rng = SafetyFilter(SafetyConfig(), limits), np.random.default_rng(1)
     p, v, before = np.array([0.0, 0.0, 2.5]), np.zeros(3), np.zeros(3)
-    nothing = prediction_of(np.zeros((0, 3)), np.zeros((0, 3)), 0.2)
+    nothing = uniform_motion(np.zeros((0, 3)), np.zeros((0, 3)), radius_m=0.2)
     for step in range(300):
         if step % 60 == 0:
             push = rng.choice([-3.0, 3.0], 3)
@@ -98,20 +99,6 @@ def test_with_a_slew_limit_no_push_passes_a_wall(slew: float, tick_s: float) -> 
         p, v = p + tick_s * v + 0.5 * tick_s**2 * before, v + tick_s * before
         assert (p <= np.array(limits.arena_max) + 0.02).all()
         assert (p >= np.array(limits.arena_min) - 0.02).all()
-
-
-def prediction_of(p: np.ndarray, v: np.ndarray, radius: float) -> Prediction:
-    t = DT * np.arange(23)
-    return Prediction(
-        start_ns=0,
-        dt_s=DT,
-        ids=tuple(str(index) for index in range(len(p))),
-        p_enu=frozen(p[:, None] + t[:, None] * v[:, None]),
-        sigma_m=frozen(np.zeros((len(p), 23))),
-        v_enu=frozen(v),
-        a_enu=frozen(np.zeros((len(p), 3))),
-        radius_m=frozen(np.full(len(p), radius)),
-    )
 
 
 def test_rows_exist_for_what_is_too_large_only() -> None:
@@ -142,7 +129,7 @@ def test_the_vehicle_stops_before_what_it_cannot_swerve_round(speed: float, obst
     o, ov = np.array([[0.0, 0.0, 10.0]]), np.array([[obstacle_speed, 0.0, 0.0]])
     for _ in range(200):
         a_ref = np.clip(3.0 * (np.array([speed, 0.0, 0.0]) - v), -3.0, 3.0)
-        result = guard.step(FilterInput(p, v, a_ref, prediction_of(o, ov, 6.0), elapsed_s=DT))
+        result = guard.step(FilterInput(p, v, a_ref, uniform_motion(o, ov, radius_m=6.0), elapsed_s=DT))
         verdicts.add(result.verdict)
         p, v, o = p + DT * v, v + DT * result.a_safe, o + DT * ov
         assert math.dist(p, o[0]) >= 6.2
@@ -152,7 +139,7 @@ def test_the_vehicle_stops_before_what_it_cannot_swerve_round(speed: float, obst
 
 def test_a_braking_row_is_recorded_with_its_track() -> None:
     guard = SafetyFilter(SafetyConfig(), LimitsConfig(arena_min=(-60.0, -60.0, 0.3), arena_max=(60.0, 60.0, 40.0)))
-    near = prediction_of(np.array([[12.75, 0.0, 10.0]]), np.zeros((1, 3)), 6.0)
+    near = uniform_motion(np.array([[12.75, 0.0, 10.0]]), np.zeros((1, 3)), radius_m=6.0)
     p, v = np.array([0.0, 0.0, 10.0]), np.array([5.0, 0.0, 0.0])
     result = guard.step(FilterInput(p, v, np.array([3.0, 0.0, 0.0]), near))
     assert result.verdict is Verdict.ADJUSTED
@@ -166,7 +153,9 @@ def test_a_braking_row_is_recorded_with_its_track() -> None:
 def test_the_paper_has_no_braking_rows() -> None:
     guard = SafetyFilter(SafetyConfig(braking=False), LimitsConfig())
     task = guard.build(
-        FilterInput(np.zeros(3), np.zeros(3), np.zeros(3), prediction_of(np.full((1, 3), 9.0), np.zeros((1, 3)), 6.0))
+        FilterInput(
+            np.zeros(3), np.zeros(3), np.zeros(3), uniform_motion(np.full((1, 3), 9.0), np.zeros((1, 3)), radius_m=6.0)
+        )
     )
     assert task.stops is None
 

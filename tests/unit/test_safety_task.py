@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from safety_scenes import uniform_motion
 
 from companion.config import LimitsConfig, SafetyConfig
 from companion.safety.barrier import Barrier, BarrierRows
@@ -22,17 +23,8 @@ def rows_of(
     v: tuple[float, ...] = (0.0, 0.0, 0.0),
     radii: tuple[float, ...] | None = None,
 ) -> BarrierRows:
-    count, t = len(offsets), 0.05 * np.arange(23)
-    start, velocity = ORIGIN + np.reshape(offsets, (count, 3)), np.reshape(velocities, (count, 3))
-    prediction = Prediction(
-        start_ns=0,
-        dt_s=0.05,
-        ids=tuple(str(index) for index in range(count)),
-        p_enu=frozen(start[:, None] + t[:, None] * velocity[:, None]),
-        sigma_m=frozen(np.zeros((count, 23))),
-        v_enu=frozen(velocity),
-        a_enu=frozen(np.zeros((count, 3))),
-        radius_m=frozen(np.full(count, 0.2) if radii is None else radii),
+    prediction = uniform_motion(
+        ORIGIN + np.reshape(offsets, (-1, 3)), velocities, radius_m=0.2 if radii is None else radii
     )
     return Barrier(CONFIG).rows(ORIGIN, np.array(v), prediction, 0.0)
 
