@@ -133,7 +133,8 @@ class Pilot:
         flying = inputs.task is not Task.STAY
         estimate = self._observer.update(vehicle.v_enu, elapsed_s, adapt=sent and inputs.task is Task.FLY)
         disturbance = estimate if flying else _ZERO
-        result = self._filtered(vehicle, p_act, v_act, u_ref, prediction, flying, elapsed_s)
+        leads = inputs.task is Task.FLY and inputs.target_enu is not None
+        result = self._filtered(vehicle, p_act, v_act, u_ref, prediction, elapsed_s, flying=flying, leads=leads)
         wire = frozen(result.a_safe - disturbance)
         self._commands.append((prediction.start_ns, result.a_safe if sent else _ZERO))
         self._observer.command(wire if sent else _ZERO, saturated=self._saturated(wire))
@@ -156,7 +157,7 @@ class Pilot:
         prediction = self._track(frames, vehicle.stamp_ns)
         self._tracker.note_vehicle(vehicle)
         p_act, v_act = self._at_action(vehicle)
-        result = self._filtered(vehicle, p_act, v_act, frozen(a_ref), prediction, True, elapsed_s)
+        result = self._filtered(vehicle, p_act, v_act, frozen(a_ref), prediction, elapsed_s)
         self._commands.append((prediction.start_ns, result.a_safe))
         return result
 
@@ -232,8 +233,10 @@ class Pilot:
         v_act: Vec3,
         u_ref: Vec3,
         prediction: Prediction,
-        flying: bool,
         elapsed_s: float | None,
+        *,
+        flying: bool = True,
+        leads: bool = True,
     ) -> FilterResult:
         if self._config.safety.filter == "none":
             return FilterResult(u_ref, Verdict.NOMINAL, None, (), 0, "none")
@@ -246,6 +249,7 @@ class Pilot:
                 prediction=prediction,
                 p_std_m=vehicle.p_std_m,
                 limits_on=flying,
+                detours=leads,
                 accel_shrink_m_s2=full - self._config.reference_limit_m_s2,
                 elapsed_s=elapsed_s,
                 a_before=self._commands[-1][1] if self._commands else None,

@@ -157,3 +157,4 @@ class FilterResult:
     rows: tuple[RowRecord, ...]  # active rows: slack below 0.05 m/s^2, the worst of each obstacle always listed
     iterations: int  # QPs solved
     solver: str
+    detour: bool = False  # the answer to a reference along the boundary, not to the one that was asked

@@ -30,6 +30,7 @@ from companion.config import LimitsConfig, SafetyConfig
 from companion.errors import SolverError
 from companion.safety.adapt import clf_budget, decay_interval, epsilon_star
 from companion.safety.barrier import Barrier
+from companion.safety.detour import Detour
 from companion.safety.limits import DIAGONAL, Capability, capability, vehicle_limits
 from companion.safety.relax import braking, least_violation
 from companion.safety.search import least_of_ways
@@ -51,6 +52,7 @@ class FilterInput:
     prediction: Prediction  # obstacles from the same instant on, k = 0..N+2
     p_std_m: float = 0.0  # 1 sigma of the vehicle's own position
     limits_on: bool = True  # arena, floor and ceiling; off in READY
+    detours: bool = True  # whether the reference leads to a target, round what stands in the way
     accel_shrink_m_s2: float = 0.0  # the box is smaller by what the disturbance estimate may add
     elapsed_s: float | None = None  # vehicle time since the last call, None on the first
     a_before: Vec3 | None = None  # the last setpoint sent, for slew; None: hover [m/s^2]
@@ -66,7 +68,7 @@ class Answer:
 
 
 class SafetyFilter:
-    """Admissible accelerations, tick by tick. Hidden state: the last answer and each obstacle's epsilon."""
+    """Admissible accelerations, tick by tick. Hidden state: last answer, epsilons, a detour under way."""
 
     def __init__(self, safety: SafetyConfig, limits: LimitsConfig) -> None:
         self._safety = safety
@@ -80,6 +82,7 @@ class SafetyFilter:
         """Forget the last answer and every epsilon: the next step equals the first of a new filter, bit for bit."""
         self._last: Vec3 | None = None
         self._epsilon: dict[str, float] = {}
+        self._detour = Detour()
 
     def step(self, inputs: FilterInput) -> FilterResult:
         """The safe acceleration for one tick: build, solve, verify; never raises on finite input.
@@ -87,8 +90,19 @@ class SafetyFilter:
         Raises:
             ValueError: the prediction is shorter than horizon + 3 instants.
         """
-        task = self.build(inputs)
-        return self.verify(task, self.solve(task, inputs.elapsed_s or 0.0))
+        task, elapsed_s, detour = self.build(inputs), inputs.elapsed_s or 0.0, self._detour
+        turned_off = inputs.detours and detour.active
+        if turned_off:
+            task = replace(task, a_ref=detour.reference(task))
+        result = self.verify(task, self.solve(task, elapsed_s))
+        if turned_off:
+            nominal = result.verdict is Verdict.NOMINAL
+            result = replace(result, verdict=Verdict.ADJUSTED if nominal else result.verdict, detour=True)
+        if inputs.detours:
+            refused = result.verdict is not Verdict.NOMINAL
+            in_the_way = refused and result.worst is not None and result.worst.track in task.rows.ids
+            detour.note(inputs.p_enu, inputs.a_ref, elapsed_s, in_the_way=in_the_way)
+        return result
 
     def build(self, inputs: FilterInput) -> Task:
         """The tick's problem: rows, limits and epsilon*, from which tests can read every matrix.
