@@ -9,13 +9,14 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 
 from companion.config import Config
 from companion.disturbance import DisturbanceObserver
 from companion.errors import BrainFailure, PolicyOutputInvalid
-from companion.policy import Policy, brake, hold, load_policy
+from companion.policy import brake, hold, load_policy
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.tracking.tracker import Tracker
 from companion.types import (
@@ -40,6 +41,17 @@ class Task(StrEnum):
     STAY = "stay"  # hold where the vehicle is now, anchored anew each tick (READY)
     FLY = "fly"  # to the target, or hold where engaged without one (ACTIVE)
     HOLD = "hold"  # brake, then hold position (HOLD)
+
+
+class ReferenceLaw(Protocol):
+    """What the pilot asks for its reference: a loaded `Policy`, or a law of your own."""
+
+    def act(self, v_enu: Vec3, error_enu: Vec3) -> Vec3:
+        """Net acceleration for velocity and target minus position [m/s^2]; the pilot bounds it.
+
+        Raises:
+            PolicyOutputInvalid: there is none; the vehicle then brakes.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +89,7 @@ class Pilot:
         ArtifactError: at construction, where the policy cannot be flown with this configuration.
     """
 
-    def __init__(self, config: Config, policy: Policy | None = None) -> None:
+    def __init__(self, config: Config, policy: ReferenceLaw | None = None) -> None:
         self._config = config
         self._policy = load_policy(config.policy, config.limits) if policy is None else policy
         self._tracker = Tracker(config.tracking, config.safety.drone_radius_m)

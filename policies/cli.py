@@ -19,6 +19,7 @@ from companion.policy import artifact_folder
 
 TRAIN_EXAMPLE = "example: policies train --seed 1 --out runs/first && policies evaluate runs/first/artifact"
 EVALUATE_EXAMPLE = "example: policies evaluate builtin:default --starts 200 --json"
+PAPER_EXAMPLE = "example: policies paper --preset default --out runs/paper"
 ENCOUNTERS_EXAMPLE = "example: policies encounters --flights 2000 --noise 0.2236 --json"
 
 
@@ -63,10 +64,35 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("artifact", help="an artefact's folder, or builtin:NAME")
     evaluate.add_argument("--starts", type=_count, default=1000)
     evaluate.add_argument("--seed", type=_count, default=20_011, help="of the starts and targets")
+    evaluate.add_argument(
+        "--plant",
+        choices=("point", "pybullet"),
+        default="point",
+        help="a point mass with lag, or the simulated Crazyflie (slower; default: point)",
+    )
     evaluate.add_argument("--json", action="store_true", help="one JSON object on stdout")
     evaluate.set_defaults(command=_evaluate)
+    _add_paper(commands)
     _add_encounters(commands)
     return parser
+
+
+def _add_paper(commands: argparse._SubParsersAction[_Parser]) -> None:
+    paper = commands.add_parser(
+        "paper",
+        help="fly the paper's comparison: five methods, three cases, Table 3 and figures 5 to 13",
+        description="Trains what the methods need, flies all of them in PyBullet, and writes table3.md, paper.json, "
+        "the figures and the networks into a folder. Networks that the folder already has, made with the same "
+        "settings, are flown again without training. From scratch both presets take about ten minutes on two cores.",
+        epilog=PAPER_EXAMPLE,
+    )
+    paper.add_argument("--preset", choices=("both", "paper", "default"), default="both", help="the paper's parameters")
+    paper.add_argument("--out", type=Path, help="folder (default: runs/paper-<time>)")
+    paper.add_argument("--flights", type=_positive, default=10, help="of each cell, one a seed of the sensor's noise")
+    paper.add_argument("--seed", type=_count, default=0, help="of training, and of the first flight")
+    paper.add_argument("--steps", type=_positive, help="environment steps of every training (default: each its own)")
+    paper.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    paper.set_defaults(command=_paper)
 
 
 def _add_encounters(commands: argparse._SubParsersAction[_Parser]) -> None:
@@ -152,10 +178,32 @@ def _train(args: argparse.Namespace) -> int:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
+    from policies.display import flights_display
     from policies.evaluation.artifact import evaluate
 
-    figures = evaluate(artifact_folder(args.artifact), starts=args.starts, seed=args.seed)
+    with flights_display("evaluate", args.starts, shown=args.plant == "pybullet") as on_flight:
+        folder = artifact_folder(args.artifact)
+        figures = evaluate(folder, starts=args.starts, seed=args.seed, plant=args.plant, on_flight=on_flight)
     _print(figures, args.json)
+    return 0
+
+
+def _paper(args: argparse.Namespace) -> int:
+    _require_train_extra()
+    from policies.display import work_display
+    from policies.evaluation.paper import PRESET_NAMES
+    from policies.paper import Plan, compare
+
+    folder = args.out or Path("runs") / datetime.now().astimezone().strftime("paper-%Y%m%d-%H%M%S")
+    folder.mkdir(parents=True, exist_ok=True)
+    presets = PRESET_NAMES if args.preset == "both" else (args.preset,)
+    with work_display() as report:
+        result = compare(Plan(presets, folder, args.flights, args.seed, args.steps), report)
+    if args.json:
+        print(json.dumps(result))
+    else:
+        print("\n".join(result["presets"][name]["table"] for name in presets))
+        print(f"figures, table3.md and paper.json: {folder}")
     return 0
 
 

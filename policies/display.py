@@ -35,6 +35,40 @@ def training_display(steps: int) -> Iterator[Callable[[CurvePoint], None]]:
 
 
 @contextmanager
+def work_display() -> Iterator[Callable[[str, float], None]]:
+    """A bar for one piece of work after another; nothing where standard error is not a terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.file.isatty()) as progress:
+        task = progress.add_task("", total=1.0)
+
+        def show(what: str, share: float) -> None:
+            progress.update(task, description=what, completed=share)
+
+        yield show
+
+
+@contextmanager
+def flights_display(what: str, flights: int, *, shown: bool) -> Iterator[Callable[[], None]]:
+    """A bar that counts flights; nothing where it is not to be shown or standard error is not a terminal."""
+    columns = (
+        TextColumn(what),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not (shown and console.file.isatty())) as progress:
+        task = progress.add_task(what, total=flights)
+        yield lambda: progress.advance(task)
+
+
+@contextmanager
 def encounters_display(flights: int) -> Iterator[Callable[[Outcome], None]]:
     """A bar with the collisions so far; nothing where standard error is not a terminal."""
     columns = (

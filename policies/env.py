@@ -160,6 +160,8 @@ def closest_on_segment(start: FloatArray, end: FloatArray, point: FloatArray) ->
 class PointMassBatch:
     """N vehicles with a target each. Finished ones stay as they are until `reset`."""
 
+    observation_size = 6
+
     def __init__(self, config: EnvConfig, count: int, rng: np.random.Generator) -> None:
         self.config, self.count, self._rng = config, count, rng
         self.p_enu, self.v_enu, self.a_enu, self.target_enu, self._bias = (np.zeros((count, 3)) for _ in range(5))

@@ -89,11 +89,15 @@ class CurveRecorder(BaseCallback):
     """Notes a point after each rollout, hands it on, and writes checkpoints."""
 
     def __init__(
-        self, env: EnvConfig, every_steps: int, folder: Path | None, on_point: Callable[[CurvePoint], None]
+        self,
+        measure: Callable[[PPO], float],
+        every_steps: int,
+        folder: Path | None,
+        on_point: Callable[[CurvePoint], None],
     ) -> None:
         super().__init__()
         self.points: list[CurvePoint] = []
-        self._env, self._success = env, 0.0
+        self._measure, self._success = measure, 0.0
         self._every_steps, self._folder, self._on_point = every_steps, folder, on_point
         self._start_s, self._due_steps = time.perf_counter(), 0
 
@@ -107,7 +111,7 @@ class CurveRecorder(BaseCallback):
         assert isinstance(self.model, PPO)
         returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
         if len(self.points) % 8 == 7:
-            self._success = mean_success(self.model, self._env)
+            self._success = self._measure(self.model)
         point = CurvePoint(
             self.num_timesteps,
             time.perf_counter() - self._start_s,
@@ -121,9 +125,9 @@ class CurveRecorder(BaseCallback):
             save_checkpoint(self.model, self._folder / f"{self.num_timesteps}.safetensors")
 
 
-def mean_success(model: PPO, env: EnvConfig, starts: int = 200) -> float:
-    """Share of starts at rest from which the policy's mean passes the target before it leaves the arena."""
-    calm = replace(
+def calm(env: EnvConfig) -> EnvConfig:
+    """The same task from rest, without randomisation."""
+    return replace(
         env,
         start_speed_m_s=0.0,
         near_share=0.0,
@@ -134,10 +138,18 @@ def mean_success(model: PPO, env: EnvConfig, starts: int = 200) -> float:
         noise_p_std_m=0.0,
         noise_v_std_m_s=0.0,
     )
-    batch = PointMassBatch(calm, starts, np.random.default_rng(PROGRESS_SEED))
+
+
+def mean_success(model: PPO, env: EnvConfig, starts: int = 200) -> float:
+    """Share of starts at rest from which the policy's mean passes the target before it leaves the arena."""
+    return flown_share(model, PointMassBatch(calm(env), starts, np.random.default_rng(PROGRESS_SEED)))
+
+
+def flown_share(model: PPO, batch: PointMassBatch) -> float:
+    """Share of a batch that reaches its target before its episode ends otherwise."""
     observation = batch.observe()
-    ended, reached = np.zeros((2, starts), dtype=np.bool_)
-    for _ in range(env.max_steps):
+    ended, reached = np.zeros((2, batch.count), dtype=np.bool_)
+    for _ in range(batch.config.max_steps):
         action, _ = model.predict(observation.astype(np.float32), deterministic=True)
         step = batch.step(action)
         reached |= step.reached & ~ended
@@ -148,13 +160,18 @@ def mean_success(model: PPO, env: EnvConfig, starts: int = 200) -> float:
     return float(reached.mean())
 
 
+def learning_rate(config: TrainConfig) -> Callable[[float], float]:
+    """Falls linearly with the share of the training that remains, to a twentieth."""
+    return lambda remaining: config.learning_rate * max(remaining, 0.05)
+
+
 def build(env: EnvConfig, config: TrainConfig) -> PPO:
     """PPO as configured, untrained."""
     torch.set_num_threads(config.threads)
     return PPO(
         AxisSharedPolicy,
         PointMassVecEnv(env, config.vehicles, config.seed, reward_scale=config.reward_scale),
-        learning_rate=lambda remaining: config.learning_rate * max(remaining, 0.05),
+        learning_rate=learning_rate(config),
         n_steps=config.rollout,
         batch_size=config.batch,
         n_epochs=config.epochs,
@@ -194,7 +211,9 @@ def train(
     model = build(env, config)
     if resume is not None:
         restore_checkpoint(model, resume)
-    recorder = CurveRecorder(env, max(1, config.steps // config.checkpoints), checkpoints, on_point)
+    recorder = CurveRecorder(
+        lambda trained: mean_success(trained, env), max(1, config.steps // config.checkpoints), checkpoints, on_point
+    )
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
     if model.num_timesteps < config.steps:
         model.learn(config.steps - model.num_timesteps, callback=recorder, reset_num_timesteps=resume is None)

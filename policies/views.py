@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -15,9 +15,9 @@ from policies.env import EnvConfig, PointMassBatch
 ONE = np.ones(1, dtype=np.bool_)
 
 
-def _spaces() -> tuple[Any, Any]:
+def _spaces(size: int) -> tuple[Any, Any]:
     return (
-        gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float32),
+        gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32),
         gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32),
     )
 
@@ -29,7 +29,7 @@ class PointMassGym(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.float32
 
     def __init__(self, config: EnvConfig) -> None:
         self.config = config
-        self.observation_space, self.action_space = _spaces()
+        self.observation_space, self.action_space = _spaces(PointMassBatch.observation_size)
         self._batch: PointMassBatch | None = None
 
     def reset(
@@ -56,16 +56,27 @@ class PointMassGym(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.float32
         )
 
 
-class PointMassVecEnv(VecEnv):
+class BatchVecEnv(VecEnv):
     """Thousands of vehicles in one process, with stable-baselines3's automatic reset.
 
     ``infos`` of a finished one carry ``terminal_observation``, ``TimeLimit.truncated``, ``is_success`` and ``episode``.
+
+    Args:
+        make: a batch of ``count`` vehicles for a generator.
     """
 
-    def __init__(self, config: EnvConfig, count: int, seed: int, *, reward_scale: float = 1.0) -> None:
+    def __init__(
+        self,
+        make: Callable[[np.random.Generator], PointMassBatch],
+        count: int,
+        seed: int,
+        *,
+        reward_scale: float = 1.0,
+    ) -> None:
         self.render_mode = None
-        super().__init__(count, *_spaces())
-        self.batch = PointMassBatch(config, count, np.random.default_rng(seed))
+        self._make = make
+        self.batch = make(np.random.default_rng(seed))
+        super().__init__(count, *_spaces(self.batch.observation_size))
         self._action = np.zeros((count, 3), dtype=np.float32)
         self._return = np.zeros(count)
         self.reward_scale = reward_scale
@@ -115,5 +126,12 @@ class PointMassVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Restart the random stream of all vehicles."""
         if seed is not None:
-            self.batch = PointMassBatch(self.batch.config, self.num_envs, np.random.default_rng(seed))
+            self.batch = self._make(np.random.default_rng(seed))
         return [seed] * self.num_envs
+
+
+class PointMassVecEnv(BatchVecEnv):
+    """The task of the policy: no obstacle in sight."""
+
+    def __init__(self, config: EnvConfig, count: int, seed: int, *, reward_scale: float = 1.0) -> None:
+        super().__init__(lambda rng: PointMassBatch(config, count, rng), count, seed, reward_scale=reward_scale)
