@@ -155,7 +155,7 @@ def test_without_obstacles_and_description() -> None:
     assert resolve("demo", scenario, 1, obstacles=False).obstacles == ()
     told = describe(resolve("demo", scenario, 1), "uav7")
     assert told["prefix"] == "uav/uav7"
-    assert told["target"] == (7.0, 0.0, 1.5)
+    assert told["target"] == (6.5, 0.0, 1.5)
     assert told["sources"] == ["sim"]
     assert [step["do"] for step in told["operator"]] == ["arm", "takeoff", "engage"]
     assert told["obstacles"] != describe(resolve("demo", scenario, 2), "uav7")["obstacles"]
