@@ -19,6 +19,7 @@ from companion.policy import artifact_folder
 
 TRAIN_EXAMPLE = "example: policies train --seed 1 --out runs/first && policies evaluate runs/first/artifact"
 EVALUATE_EXAMPLE = "example: policies evaluate builtin:default --starts 200 --json"
+BENCH_EXAMPLE = "example: policies bench builtin:default --calls 20000"
 PAPER_EXAMPLE = "example: policies paper --preset default --out runs/paper"
 ENCOUNTERS_EXAMPLE = "example: policies encounters --flights 2000 --noise 0.2236 --json"
 
@@ -72,6 +73,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument("--json", action="store_true", help="one JSON object on stdout")
     evaluate.set_defaults(command=_evaluate)
+    bench = commands.add_parser("bench", help="time one inference on each backend", epilog=BENCH_EXAMPLE)
+    bench.add_argument("artifact", nargs="?", default="builtin:default", help="an artefact's folder, or builtin:NAME")
+    bench.add_argument("--calls", type=_positive, default=20_000)
+    bench.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    bench.set_defaults(command=_bench)
     _add_paper(commands)
     _add_encounters(commands)
     return parser
@@ -185,6 +191,22 @@ def _evaluate(args: argparse.Namespace) -> int:
         folder = artifact_folder(args.artifact)
         figures = evaluate(folder, starts=args.starts, seed=args.seed, plant=args.plant, on_flight=on_flight)
     _print(figures, args.json)
+    return 0
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from policies.bench import measure
+
+    figures = measure(artifact_folder(args.artifact), args.calls)
+    if args.json:
+        print(json.dumps(figures))
+        return 0
+    print(f"{figures['calls']} calls on one thread, microseconds")
+    print(f"{'':28s}{'p50':>9s}{'p99':>9s}{'p99.9':>9s}{'max':>9s}")
+    for name, values in figures["milliseconds"].items():
+        shown = ["-" if values[key] is None else f"{1e3 * values[key]:.1f}" for key in ("p50", "p99", "p999", "max")]
+        print(f"{name:28s}" + "".join(f"{text:>9s}" for text in shown))
+    print(figures["left_out"] or f"greatest difference of the backends: {figures['greatest_difference']:.1e}")
     return 0
 
 

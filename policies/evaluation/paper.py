@@ -23,12 +23,11 @@ from companion.types import Detection, DetectionFrame, DetectionKind, Vec3, Vehi
 from policies.env import PRESETS, FloatArray
 from policies.evaluation.bullet import PERIOD_S, Arrival, BulletVehicle
 from sim_bridge.placement import resolve
-from sim_bridge.scenario import Scenario, load_scenario
+from sim_bridge.scenario import BUILTIN, Scenario, load_scenario
 from sim_bridge.sensors import Frame, Sensor
 
 PresetName = Literal["paper", "default"]
 PRESET_NAMES: tuple[PresetName, ...] = ("paper", "default")
-CASES = Path(__file__).resolve().parents[2] / "configs" / "paper"
 CASE_NAMES = ("case1", "case2", "case3")
 METHODS = ("Pure RL (Case 1)", "Pure RL (Case 2)", "Pure RL (Case 3)", "PID+ACBF", "RL+ACBF")
 PAPERS_TABLE: dict[str, tuple[str, tuple[float, float, float]]] = {  # training time, minimum distance [m]
@@ -108,9 +107,10 @@ class Cell:
         }
 
 
-def load_case(name: str, folder: Path = CASES) -> Scenario:
-    """A case's scenario; the daemon's demo flies the same files."""
-    return load_scenario(str(folder / f"{name}.toml"))[1]
+def load_case(name: str) -> Scenario:
+    """A shipped case's scenario, configs/paper/NAME.toml; `companion demo --scenario` flies the same files."""
+    (path, *_) = (path for folder in BUILTIN if (path := folder / "paper" / f"{name}.toml").is_file())
+    return load_scenario(str(path))[1]
 
 
 class _PilotLaw:

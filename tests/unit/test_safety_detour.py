@@ -61,6 +61,8 @@ def test_a_detour_keeps_the_boundary_on_the_left_and_near(
 def test_a_detour_brakes_what_leads_elsewhere_within_the_box() -> None:
     a = Detour().reference(task_of([(1.0, 0.0, 0.0)], v=(0.2, 3.0, 0.4), limit=1.5))
     assert a == pytest.approx([2.0 * (0.3 - 0.2), -1.5, -0.8])
+    a = Detour().reference(task_of([(1.0, 0.0, 0.0)], v=(0.2, -3.0, 0.4), limit=1.5))
+    assert a == pytest.approx([2.0 * (0.3 - 0.2), 1.5, -0.8])
 
 
 def test_the_nearer_of_two_obstacles_decides_more_and_one_far_away_nothing() -> None:
