@@ -169,8 +169,8 @@ class SafetyFilter:
         ways = Ways(reduced, a_ref if self._last is None else self._last)
         verdict = Verdict.ADJUSTED
         try:
-            found = least_of_ways(reduced, balls, ways, self._order)
-            if not found.admissible:
+            found = None if self._hopeless(reduced) else least_of_ways(reduced, balls, ways, self._order)
+            if found is None or not found.admissible:
                 found = least_violation(reduced, ways, self._order)
         except SolverError:
             found, verdict = braking(reduced, ways), Verdict.BRAKING
@@ -182,6 +182,11 @@ class SafetyFilter:
         epsilon[taken] = found.epsilon
         found = Found(found.a, epsilon, found.admissible, found.cost, found.iterations, found.solver)
         return Answer(found, values, verdict)
+
+    def _hopeless(self, task: Task) -> bool:
+        """No acceleration at all stops in time: nothing admissible to search for."""
+        limits = task.limits
+        return task.stops is not None and task.stops.beyond(limits.low, limits.high, 10.0 * self._safety.tolerance_m_s2)
 
     def verify(self, task: Task, answer: Answer) -> FilterResult:
         """The verdict and the record: the true rows at the answer decide between adjusted and relaxed."""

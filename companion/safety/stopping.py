@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from companion.types import FloatArray
+from companion.types import FloatArray, Vec3
 
 RETURN_RATE_HZ = 1.0  # speed back out of what should not have been entered, per metre
 _HALVINGS = 24  # of an interval of some m/s^2: below 1e-6 m/s^2
@@ -90,6 +90,11 @@ class StopRows:
     def slack(self, a: FloatArray) -> FloatArray:
         """Room left at ``a`` (C, 3), negative where broken, (C, M) [m/s^2]."""
         return np.asarray(a @ self.normal.T - self.floor)
+
+    def beyond(self, low: Vec3, high: Vec3, by_m_s2: float) -> bool:
+        """Whether some row is broken by more than ``by_m_s2`` at every acceleration of the box."""
+        most = np.add.reduce(np.maximum(self.normal * low, self.normal * high), axis=-1)
+        return bool(np.maximum.reduce(self.floor - most, initial=-math.inf) > by_m_s2)
 
     def select(self, taken: npt.NDArray[np.intp]) -> StopRows:
         """The rows of some obstacles only."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from functools import partial
 
 import msgspec
@@ -577,3 +578,21 @@ def test_a_stop_is_before_the_first_rows_keep_out_distance() -> None:
     task = SafetyFilter(config, LIMITS).build(tick(prediction, v=(0.0, 0.0, 0.0)))
     assert task.stops is not None
     assert task.stops.floor[0] == pytest.approx(-capability(LIMITS, shrink_m_s2=0.0, dt_s=0.05).braking.bound(6.7, 0.0))
+
+
+def test_an_answer_that_cannot_be_admissible_is_not_searched_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The short cut of the stops leaves every answer as it was, with one program less."""
+    config = SafetyConfig(sigma_delay_s=0.0, horizon=5)
+    rng = np.random.default_rng(8)
+    states = []
+    for _ in range(30):
+        offset = rng.normal(size=3) * (2.0, 2.0, 0.5)
+        moved = tuple((offset / np.linalg.norm(offset) * rng.uniform(0.6, 2.0)).tolist())
+        prediction = straight([np.array([0.0, 0.0, 2.0]) + moved], [tuple((-2.0 * np.array(moved)).tolist())])
+        states.append(tick(prediction, v=tuple(rng.normal(size=3).tolist())))
+    told = [SafetyFilter(config, LIMITS).step(state) for state in states]
+    monkeypatch.setattr(StopRows, "beyond", lambda *_: False)
+    searched = [SafetyFilter(config, LIMITS).step(state) for state in states]
+    answers = [[(result.a_safe.tobytes(), result.verdict) for result in results] for results in (told, searched)]
+    assert answers[0] == answers[1]
+    assert Counter(result.verdict for result in told)[Verdict.RELAXED] > 10

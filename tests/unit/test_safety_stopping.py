@@ -208,3 +208,18 @@ def test_a_selection_of_rows_keeps_normals_and_floors_together() -> None:
     selected = rows.select(np.array([2, 0]))
     assert selected.normal.tolist() == [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
     assert selected.floor.tolist() == [3.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("floor", "beyond"),
+    [
+        ((-1.0, -1.0), False),
+        ((2.2 - 1e-9, -np.inf), False),  # 0.6 x 2 + 0.8 x 1 = 2 is the most that the box has along the first normal
+        ((2.2 + 1e-9, -1.0), True),
+        ((-1.0, 3.2 + 1e-9), True),  # along the second, which points down, 3
+        ((-np.inf, 3.2 - 1e-9), False),
+    ],
+)
+def test_a_row_that_the_whole_box_breaks_is_known_at_once(floor: tuple[float, float], beyond: bool) -> None:
+    rows = StopRows(np.array([[0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]), np.array(floor))
+    assert rows.beyond(np.array([-1.0, -2.0, -3.0]), np.array([2.0, 2.0, 1.0]), 0.2) is beyond
