@@ -10,15 +10,13 @@ from typing import Any
 
 import msgspec
 
-from companion.config import Config
-from companion.pilot import ReferenceLaw
 from companion.policy import load_policy
 from policies.baselines import pure_rl
 from policies.baselines.pid import PositionPid
 from policies.env import PRESETS
 from policies.evaluation import paper
 from policies.evaluation.bullet import PERIOD_S
-from policies.evaluation.paper import CASE_NAMES, Cell, Flown, Preset, PresetName
+from policies.evaluation.paper import CASE_NAMES, Cell, Method, Preset, PresetName
 from policies.evaluation.paper_figures import draw_case
 from policies.run import provenance, run
 from policies.train import TRAIN_PRESETS, CurvePoint, TrainConfig
@@ -52,33 +50,33 @@ def compare(plan: Plan, report: Report = lambda what, share: None) -> dict[str, 
 def _compare_preset(chosen: Preset, plan: Plan, report: Report) -> dict[str, Any]:
     networks = plan.folder / "networks" / chosen.name
     ours = _our_policy(chosen, plan, networks / "rl", report)
-    config = chosen.with_policy(ours["artifact"])
     training: dict[str, dict[str, Any]] = {"RL+ACBF": ours}
-    laws: dict[str, paper.EndToEndLaw] = {}
-    for number, case in enumerate(pure_rl.CASES, start=1):
-        method = f"Pure RL (Case {number})"
-        law, training[method] = _end_to_end(chosen, case, plan, networks / f"pure_rl_{case}", method, report)
-        laws[method] = law.act
+    config = chosen.with_policy(ours["artifact"])
     policy = load_policy(config.policy, config.limits)
+    methods = {
+        "PID+ACBF": Method("PID+ACBF", config, reference=lambda: PositionPid(PERIOD_S)),
+        "RL+ACBF": Method("RL+ACBF", config, reference=lambda: policy),
+    }
+    for number, case in enumerate(pure_rl.CASES, start=1):
+        name = f"Pure RL (Case {number})"
+        law, training[name] = _end_to_end(chosen, case, plan, networks / f"pure_rl_{case}", name, report)
+        methods[name] = Method(name, config, end_to_end=law.act)
     cases: dict[str, dict[str, Cell]] = {}
-    scenarios: dict[str, Scenario] = {}
+    crossings: dict[str, dict[str, float | None]] = {}
     for index, case_name in enumerate(CASE_NAMES):
-        scenarios[case_name] = paper.retimed(paper.load_case(case_name), chosen, policy, config)
-        cases[case_name] = {}
-        for place, method in enumerate(paper.METHODS):
-            report(f"{chosen.name}: fly {case_name}, {method}", (index * 5 + place) / 15)
-            cases[case_name][method] = _cell(
-                scenarios[case_name], chosen, plan, config, method, laws.get(method), policy
-            )
+        cases[case_name], crossings[case_name] = {}, {}
+        for place, name in enumerate(paper.METHODS):
+            report(f"{chosen.name}: fly {case_name}, {name}", (index * 5 + place) / 15)
+            scenario = paper.retimed(paper.load_case(case_name), chosen, methods[name])
+            crossings[case_name][name] = scenario.obstacles[0].cross_at_s
+            cases[case_name][name] = _cell(scenario, chosen, methods[name], plan)
     seconds = {method: figures["seconds"] for method, figures in training.items()}
     return {
         "table": paper.table(chosen.name, cases, seconds),
         "training": training,
-        "cross_at_s": {name: scenario.obstacles[0].cross_at_s for name, scenario in scenarios.items()},
+        "cross_at_s": crossings,
         "cases": {name: {method: cell.to_json() for method, cell in row.items()} for name, row in cases.items()},
-        "figures": [
-            str(path) for name in CASE_NAMES for path in _draw(name, cases[name], scenarios[name], chosen, plan)
-        ],
+        "figures": [str(path) for name in CASE_NAMES for path in _draw(name, cases[name], chosen, plan)],
     }
 
 
@@ -111,7 +109,7 @@ def _end_to_end(
     made = {
         "seconds": seconds,
         "steps": config.steps,
-        "success_own_case": pure_rl.success(model, env, case, 1000),
+        "success_by_case": {other: pure_rl.success(model, env, other, 1000) for other in pure_rl.CASES},
         "seconds_to_99_percent": None if to_99 is None else to_99.seconds,
     }
     return pure_rl.EndToEnd(model, chosen.k_ma_m_s2), _remember(folder, settings, made)
@@ -137,37 +135,17 @@ def _shown(what: str, config: TrainConfig, report: Report) -> Callable[[CurvePoi
     return lambda point: report(f"{what}, {point.success:.0%}", point.steps / config.steps)
 
 
-def _cell(
-    scenario: Scenario,
-    chosen: Preset,
-    plan: Plan,
-    config: Config,
-    method: str,
-    law: paper.EndToEndLaw | None,
-    policy: ReferenceLaw,
-) -> Cell:
-    """The flights of one method in one case, one a seed of the sensor."""
-
-    def fly(seed: int) -> Flown:
-        if law is not None:
-            return paper.fly_case(scenario, chosen, seed=seed, end_to_end=law)
-        reference = PositionPid(PERIOD_S) if method == "PID+ACBF" else policy
-        return paper.fly_case(scenario, chosen, seed=seed, reference=reference, config=config)
-
-    first = fly(plan.seed)
-    # Pure RL sees the truth, so that its flights are all the same
-    rest = [] if law is not None else [fly(plan.seed + k) for k in range(1, plan.flights)]
-    flown = [first, *rest]
-    return Cell(
-        first,
-        tuple(flight.clearance_m for flight in flown),
-        sum(flight.collided for flight in flown),
-        sum(flight.arrival_s is not None for flight in flown),
-    )
+def _cell(scenario: Scenario, chosen: Preset, method: Method, plan: Plan) -> Cell:
+    """The flights of one method in one case. Pure RL sees the truth, so that its flights are all the same."""
+    exact = paper.fly_case(scenario, chosen, method, exact=True)
+    seeds = range(plan.seed, plan.seed + plan.flights) if method.end_to_end is None else ()
+    return Cell(exact, tuple(paper.fly_case(scenario, chosen, method, seed=seed) for seed in seeds))
 
 
-def _draw(case: str, row: dict[str, Cell], scenario: Scenario, chosen: Preset, plan: Plan) -> list[Path]:
+def _draw(case: str, row: dict[str, Cell], chosen: Preset, plan: Plan) -> list[Path]:
+    """The figures of one case, of the flights on exact positions."""
     own = f"Pure RL (Case {CASE_NAMES.index(case) + 1})"
-    flights = {name: row[method].flight for name, method in (("RL+ACBF",) * 2, ("PID+ACBF",) * 2, ("Pure RL", own))}
-    assert scenario.target is not None
-    return draw_case(case, flights, scenario.target.position, plan.folder / chosen.name, f"preset {chosen.name}")
+    flights = {name: row[method].exact for name, method in (("RL+ACBF",) * 2, ("PID+ACBF",) * 2, ("Pure RL", own))}
+    target = paper.load_case(case).target
+    assert target is not None, "checked by the tests of the shipped cases"
+    return draw_case(case, flights, target.position, plan.folder / chosen.name, f"preset {chosen.name}")

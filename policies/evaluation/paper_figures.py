@@ -51,11 +51,9 @@ def _paths(title: str, flights: dict[str, Flown], target: tuple[float, ...]) -> 
     axes = figure.add_subplot(projection="3d")
     for name, flight in flights.items():
         axes.plot(*flight.p_enu.T, STYLES[name], color=COLOURS[name], linewidth=2.0, label=name)
+        axes.plot(*flight.obstacle_enu.T, ":", color=COLOURS[name], linewidth=1.2, label=f"its obstacle ({name})")
         if flight.collided:
             axes.scatter(*flight.p_enu[-1], color=COLOURS[name], marker="x", s=90, linewidths=3.0)
-    longest = max(flights.values(), key=lambda flight: len(flight.t_s))
-    axes.plot(*longest.obstacle_enu.T, ":", color=_GREY, linewidth=1.5, label="obstacle")
-    axes.scatter(*longest.obstacle_enu[0], color=_GREY, s=30)
     first = next(iter(flights.values()))
     axes.scatter(*first.p_enu[0], color=_INK, marker="o", s=40, label="start")
     axes.scatter(*target, color=_INK, marker="*", s=140, label="target")

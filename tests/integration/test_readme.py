@@ -6,6 +6,7 @@ import contextlib
 import json
 import re
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
@@ -24,9 +25,9 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def example(name: str) -> str:
-    match = re.search(rf"<!-- example: {name} -->\n```python\n(.*?)```", README, re.DOTALL)
-    assert match is not None, f"README.md: no example {name}"
+def example(name: str, text: str = README) -> str:
+    match = re.search(rf"<!-- example: {name} -->\n```python\n(.*?)```", text, re.DOTALL)
+    assert match is not None, f"no example {name}"
     return match[1]
 
 
@@ -39,6 +40,18 @@ def test_library_example() -> None:
     done = subprocess.run([sys.executable, "-c", example("library")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("adjusted")
+
+
+def test_a_network_of_your_own_flies_as_the_page_says(tmp_path: Path) -> None:
+    """docs/policies.md: an ONNX file from elsewhere (here the shipped one's) becomes an artefact that evaluates."""
+    shutil.copy(ROOT / "policies" / "artifacts" / "default" / "policy.onnx", tmp_path / "my_policy.onnx")
+    code = example("foreign", (ROOT / "docs" / "policies.md").read_text(encoding="utf-8"))
+    made = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    command = [sys.executable, "-m", "policies.cli", "evaluate", "mine", "--starts", "3", "--json"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["starts"] == 3
 
 
 @pytest.mark.integration

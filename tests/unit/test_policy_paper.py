@@ -14,10 +14,22 @@ from companion.policy import load_policy
 from policies.baselines.pid import PositionPid
 from policies.cli import main
 from policies.evaluation.bullet import PERIOD_S, Arrival, BulletVehicle
-from policies.evaluation.paper import CASE_NAMES, METHODS, Cell, Flown, fly_case, load_case, preset, retimed, table
+from policies.evaluation.paper import (
+    CASE_NAMES,
+    METHODS,
+    Cell,
+    Flown,
+    Method,
+    fly_case,
+    load_case,
+    preset,
+    retimed,
+    table,
+)
 from sim_bridge.placement import resolve
 
 POLICY = load_policy(Config().policy, Config().limits)
+OURS = Method("RL+ACBF", Config(), reference=lambda: POLICY)
 
 
 def test_an_arrival_needs_a_passage_and_then_to_stay() -> None:
@@ -61,8 +73,8 @@ def test_each_case_has_one_obstacle_of_its_motion_that_hits_the_unfiltered_vehic
     assert kind == {"case1": "Linear", "case2": "Accelerated", "case3": "FigureEight"}[case]
     assert scenario.target is not None
     chosen = preset("default")
-    timed = retimed(scenario, chosen, POLICY, chosen.config)
-    raw = fly_case(timed, chosen, seed=0, end_to_end=lambda v, e, r, w: np.clip(POLICY.act(v, e), -2.7, 2.7))
+    unfiltered = Method("raw", chosen.config, end_to_end=lambda v, e, r, w: np.clip(POLICY.act(v, e), -2.7, 2.7))
+    raw = fly_case(retimed(scenario, chosen, unfiltered), chosen, unfiltered)
     assert raw.collided
     assert raw.clearance_m == 0.0
     assert raw.arrival_s is None
@@ -70,8 +82,10 @@ def test_each_case_has_one_obstacle_of_its_motion_that_hits_the_unfiltered_vehic
 
 def test_our_method_clears_the_first_case_and_is_reproducible() -> None:
     chosen = preset("default")
-    timed = retimed(load_case("case1"), chosen, POLICY, chosen.config)
-    one, two = (fly_case(timed, chosen, seed=3, reference=POLICY) for _ in range(2))
+    timed = retimed(load_case("case1"), chosen, OURS)
+    one, two = (fly_case(timed, chosen, OURS, seed=3) for _ in range(2))
+    other, exact = fly_case(timed, chosen, OURS, seed=4), fly_case(timed, chosen, OURS, exact=True)
+    assert len({flight.clearance_m for flight in (one, other, exact)}) == 3
     assert not one.collided
     assert one.arrival_s is not None
     assert one.clearance_m > 0.16
@@ -84,7 +98,8 @@ def test_our_method_clears_the_first_case_and_is_reproducible() -> None:
 
 def test_pid_flies_behind_the_same_filter() -> None:
     chosen = preset("default")
-    flight = fly_case(load_case("case1"), chosen, seed=0, reference=PositionPid(PERIOD_S), obstacles=False)
+    method = Method("PID", chosen.config, reference=lambda: PositionPid(PERIOD_S))
+    flight = fly_case(load_case("case1"), chosen, method, obstacles=False)
     assert flight.arrival_s is not None
     assert np.isnan(flight.obstacle_enu).all()
     assert np.abs(flight.a_enu).max() <= 3.0 + 1e-9
@@ -100,25 +115,28 @@ def test_the_literal_preset_is_the_papers() -> None:
     assert chosen.config.policy.capture_radius_m == 0.0
 
 
-def cell(clearance_m: float, collisions: int) -> Cell:
+def cell(clearance_m: float, collisions: int = 0, flights: int = 10) -> Cell:
     empty = np.zeros((1, 3))
-    flown = Flown(np.zeros(1), empty, empty, empty, empty, np.zeros(1), clearance_m, collisions > 0, None, {}, 0.0)
-    return Cell(flown, (clearance_m,) * 10, collisions, 10 - collisions)
+
+    def flown(collided: bool) -> Flown:
+        least_m = 0.0 if collided else clearance_m
+        return Flown(np.zeros(1), empty, empty, empty, empty, np.zeros(1), least_m, collided, None, {}, 0.0)
+
+    return Cell(flown(False), tuple(flown(k < collisions) for k in range(flights)))
 
 
 def test_the_table_stands_beside_the_papers() -> None:
-    cases = {case: {method: cell(0.25, 0) for method in METHODS} for case in CASE_NAMES}
-    cases["case3"]["PID+ACBF"] = cell(0.0, 4)
-    lines = table("default", cases, {"RL+ACBF": 27.6}).splitlines()
-    assert (
-        "| RL+ACBF | 28 s | 0.25 m / 0.25 m / 0.25 m | 0 of 10 / 0 of 10 / 0 of 10 | 136 s | 0.32 m / 0.44 m / 0.16 m |"
-        in lines
-    )
-    assert (
-        "| PID+ACBF | N/A | 0.25 m / 0.25 m / 0.00 m | 0 of 10 / 0 of 10 / 4 of 10 | N/A | 0.37 m / 1.15 m / 0 m |"
-        in lines
-    )
-    assert len([line for line in lines if line.startswith("| ")]) == 1 + len(METHODS)
+    cases = {
+        case: {method: cell(0.25, flights=0 if method.startswith("Pure") else 10) for method in METHODS}
+        for case in CASE_NAMES
+    }
+    cases["case3"]["PID+ACBF"] = cell(0.25, 4)
+    told = table("default", cases, {"RL+ACBF": 27.6}).splitlines()
+    rows = {line.split(" | ")[0].removeprefix("| "): line.rstrip(" |").split(" | ")[1:] for line in told}
+    ours = ["28 s", "0.25 m / 0.25 m / 0.25 m", "0.25 m / 0.25 m / 0.25 m", "0 of 10 / 0 of 10 / 0 of 10"]
+    assert rows["RL+ACBF"] == [*ours, "136 s", "0.32 m / 0.44 m / 0.16 m"]
+    assert rows["PID+ACBF"][2:4] == ["0.25 m / 0.25 m / 0.00 m", "0 of 10 / 0 of 10 / 4 of 10"]
+    assert rows["Pure RL (Case 2)"] == ["N/A", ours[1], "-", "-", "160 s", "0.84 m / 0.93 m / 0 m"]
 
 
 def test_the_command_writes_table_figures_and_json_and_takes_networks_again(
