@@ -105,7 +105,7 @@ class Policy:
         self, manifest: Manifest, digest: str, network: Network, config: PolicyConfig, limits: LimitsConfig
     ) -> None:
         self.manifest, self.digest = manifest, digest  # digest: SHA-256 of the manifest, which holds the files'
-        self._network, self._config, self._limit_m_s2 = network, config, limits.acceleration_m_s2
+        self.network, self._config, self._limit_m_s2 = network, config, limits.acceleration_m_s2
         self._reach_m = min(manifest.observation.high[3:])
         self._observation: Float32 = np.zeros((1, 6), dtype=np.float32)
 
@@ -134,7 +134,7 @@ class Policy:
         farthest_m = max(abs(ex), abs(ey), abs(ez))
         share = 1.0 if farthest_m <= self._reach_m else self._reach_m / farthest_m
         self._observation[0] = (vx, vy, vz, share * ex, share * ey, share * ez)
-        x, y, z = self._network(self._observation)[0].tolist()
+        x, y, z = self.network(self._observation)[0].tolist()
         if not math.isfinite(x + y + z + vx + vy + vz + ex + ey + ez):  # a rectifier may swallow a NaN
             raise PolicyOutputInvalid(f"policy {self.manifest.name}: action {[x, y, z]}, expected finite numbers")
         return np.array([min(1.0, max(-1.0, x)), min(1.0, max(-1.0, y)), min(1.0, max(-1.0, z))])
