@@ -54,18 +54,24 @@ class AxisSharedNet(nn.Module):  # type: ignore[misc]  # mypy does not read torc
         return latent
 
 
-class AxisSharedPolicy(ActorCriticPolicy):
-    """stable-baselines3's Gaussian actor-critic around `AxisSharedNet`; the mean is the net's answer itself."""
+class SharedActorPolicy(ActorCriticPolicy):
+    """stable-baselines3's Gaussian actor-critic around a net of ours; the mean is the net's answer itself."""
+
+    net: type[nn.Module]  # of (actor width, critic width), with a last layer ``out``
 
     def __init__(self, *args: Any, actor_width: int = 32, critic_width: int = 48, **kwargs: Any) -> None:
         self._widths = (actor_width, critic_width)
         super().__init__(*args, **kwargs)
 
     def _build_mlp_extractor(self) -> None:
-        self.mlp_extractor = AxisSharedNet(*self._widths)
+        self.mlp_extractor = self.net(*self._widths)
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
         self.action_net = nn.Identity()
         nn.init.orthogonal_(self.mlp_extractor.out.weight, gain=0.01)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1.0), **self.optimizer_kwargs)
+
+
+class AxisSharedPolicy(SharedActorPolicy):
+    net = AxisSharedNet

@@ -23,8 +23,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from policies.checkpoint import restore_checkpoint, save_checkpoint
 from policies.env import PRESETS, EnvConfig, PointMassBatch
-from policies.network import AxisSharedNet, AxisSharedPolicy
-from policies.views import PointMassVecEnv
+from policies.network import AxisSharedNet, AxisSharedPolicy, SharedActorPolicy
+from policies.views import BatchVecEnv, PointMassVecEnv
 
 PROGRESS_SEED = 10_003
 
@@ -166,11 +166,18 @@ def learning_rate(config: TrainConfig) -> Callable[[float], float]:
 
 
 def build(env: EnvConfig, config: TrainConfig) -> PPO:
-    """PPO as configured, untrained."""
+    """PPO on the policy's task as configured, untrained."""
+    return ppo(
+        AxisSharedPolicy, PointMassVecEnv(env, config.vehicles, config.seed, reward_scale=config.reward_scale), config
+    )
+
+
+def ppo(policy: type[SharedActorPolicy], env: BatchVecEnv, config: TrainConfig) -> PPO:
+    """stable-baselines3's PPO with our hyperparameters."""
     torch.set_num_threads(config.threads)
     return PPO(
-        AxisSharedPolicy,
-        PointMassVecEnv(env, config.vehicles, config.seed, reward_scale=config.reward_scale),
+        policy,
+        env,
         learning_rate=learning_rate(config),
         n_steps=config.rollout,
         batch_size=config.batch,

@@ -10,13 +10,11 @@ The critic is a perceptron on a representative of each symmetry class: axes refl
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
 from companion.torch_backend import FINE
+from policies.network import SharedActorPolicy
 
 _VECTORS = 5  # v, e, fine e, r, w of one axis
 _INVARIANTS = 8
@@ -74,18 +72,5 @@ class EndToEndNet(nn.Module):  # type: ignore[misc]  # mypy does not read torch
         return latent
 
 
-class EndToEndPolicy(ActorCriticPolicy):
-    """stable-baselines3's Gaussian actor-critic around `EndToEndNet`; the mean is the net's answer itself."""
-
-    def __init__(self, *args: Any, actor_width: int, critic_width: int, **kwargs: Any) -> None:
-        self._widths = (actor_width, critic_width)
-        super().__init__(*args, **kwargs)
-
-    def _build_mlp_extractor(self) -> None:
-        self.mlp_extractor = EndToEndNet(*self._widths)
-
-    def _build(self, lr_schedule: Any) -> None:
-        super()._build(lr_schedule)
-        self.action_net = nn.Identity()
-        nn.init.orthogonal_(self.mlp_extractor.out.weight, gain=0.01)
-        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1.0), **self.optimizer_kwargs)
+class EndToEndPolicy(SharedActorPolicy):
+    net = EndToEndNet

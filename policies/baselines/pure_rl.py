@@ -16,7 +16,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
@@ -24,7 +23,7 @@ from stable_baselines3 import PPO
 from companion.errors import ArtifactError
 from policies.baselines.network import EndToEndPolicy
 from policies.env import BoolArray, EnvConfig, FloatArray, PointMassBatch, Step, closest_on_segment
-from policies.train import PROGRESS_SEED, CurvePoint, CurveRecorder, TrainConfig, calm, flown_share, learning_rate
+from policies.train import PROGRESS_SEED, CurvePoint, CurveRecorder, TrainConfig, calm, flown_share, ppo
 from policies.views import BatchVecEnv
 
 Case = Literal["linear", "accelerated", "figure_eight"]
@@ -102,31 +101,14 @@ class CaseBatch(PointMassBatch):
 
 
 def build(env: EnvConfig, case: Case, config: TrainConfig = TRAINING) -> PPO:
-    """PPO as configured, untrained."""
-    torch.set_num_threads(config.threads)
-    return PPO(
-        EndToEndPolicy,
-        BatchVecEnv(
-            lambda rng: CaseBatch(env, config.vehicles, rng, case),
-            config.vehicles,
-            config.seed,
-            reward_scale=config.reward_scale,
-        ),
-        learning_rate=learning_rate(config),
-        n_steps=config.rollout,
-        batch_size=config.batch,
-        n_epochs=config.epochs,
-        gamma=config.gamma,
-        gae_lambda=config.gae_lambda,
-        seed=config.seed,
-        device="cpu",
-        stats_window_size=500,
-        policy_kwargs={
-            "log_std_init": config.log_std,
-            "actor_width": config.actor_width,
-            "critic_width": config.critic_width,
-        },
+    """PPO on one case as configured, untrained."""
+    batches = BatchVecEnv(
+        lambda rng: CaseBatch(env, config.vehicles, rng, case),
+        config.vehicles,
+        config.seed,
+        reward_scale=config.reward_scale,
     )
+    return ppo(EndToEndPolicy, batches, config)
 
 
 def train_case(
