@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import math
 import os
@@ -149,18 +150,18 @@ def _share(text: str) -> float:
     return _not_negative(text, 1.0)
 
 
-def _require_train_extra() -> None:
-    try:
-        import gymnasium  # noqa: F401
-        import onnx  # noqa: F401
-        import stable_baselines3  # noqa: F401
-        import torch  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"train: {error.name} is not installed, expected companion-safety[train]") from None
+def _require(command: str, **modules: str) -> None:
+    """Refuse a command whose modules (name -> extra) are not installed, in one line."""
+    for module, extra in modules.items():
+        if importlib.util.find_spec(module) is None:
+            raise ConfigError(f"{command}: {module} is not installed, expected companion-safety[{extra}]")
+
+
+_TRAINING = {"gymnasium": "train", "onnx": "train", "stable_baselines3": "train", "torch": "train"}
 
 
 def _train(args: argparse.Namespace) -> int:
-    _require_train_extra()
+    _require("train", **_TRAINING)
     from policies.display import training_display
     from policies.env import PRESETS
     from policies.run import run
@@ -187,6 +188,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     from policies.display import flights_display
     from policies.evaluation.artifact import evaluate
 
+    if args.plant == "pybullet":
+        _require("evaluate --plant pybullet", pybullet="sim")
     with flights_display("evaluate", args.starts, shown=args.plant == "pybullet") as on_flight:
         folder = artifact_folder(args.artifact)
         figures = evaluate(folder, starts=args.starts, seed=args.seed, plant=args.plant, on_flight=on_flight)
@@ -211,7 +214,7 @@ def _bench(args: argparse.Namespace) -> int:
 
 
 def _paper(args: argparse.Namespace) -> int:
-    _require_train_extra()
+    _require("paper", **_TRAINING, pybullet="sim", matplotlib="sim")
     from policies.display import work_display
     from policies.evaluation.paper import PRESET_NAMES
     from policies.paper import Plan, compare

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -132,6 +133,26 @@ def test_bad_input_is_one_line_and_status_2(
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("policies:")]
     assert len(said) == 1
     assert message in said[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module", "extra"),
+    [
+        (["train"], "torch", "train"),
+        (["paper"], "pybullet", "sim"),
+        (["evaluate", "builtin:default", "--plant", "pybullet"], "pybullet", "sim"),
+    ],
+)
+def test_a_missing_extra_is_named(
+    arguments: list[str], module: str, extra: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == module else found(name))
+    assert main(arguments) == 2
+    said = f"policies: {' '.join(arguments[:1])}"
+    err = capsys.readouterr().err
+    assert err.startswith(said)
+    assert err.endswith(f": {module} is not installed, expected companion-safety[{extra}]\n")
 
 
 @pytest.mark.slow
