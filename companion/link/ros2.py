@@ -70,6 +70,12 @@ def _receiver(config: Ros2Config, topic: str, kind: MessageType, to_frame: ToFra
     known = {kind.type_hash, UNHASHED, *config.type_hashes}
     frame_ids = tuple(dict.fromkeys((config.frame_id, *config.other_frame_ids)))
 
+    def decoded(payload: bytes) -> ObstacleFrame:
+        try:
+            return to_frame(kind.decode(payload), frame_ids)
+        except (ArithmeticError, ValueError) as error:  # no such input is known; a tick must not fail on one
+            raise FrameRejected("malformed", f"{kind.name}: {error}") from None
+
     def received(key: str, payload: bytes, encoding: str) -> None:
         type_hash = key.rpartition("/")[2]
         if type_hash not in known:
@@ -79,6 +85,6 @@ def _receiver(config: Ros2Config, topic: str, kind: MessageType, to_frame: ToFra
             detail = f"expected at most {MAX_PAYLOAD_BYTES} bytes, got {len(payload)}"
             inbox.reject(source, FrameRejected("too_large", detail))
         else:
-            inbox.push_decoded(source, lambda: to_frame(kind.decode(payload), frame_ids))
+            inbox.push_decoded(source, lambda: decoded(payload))
 
     return received

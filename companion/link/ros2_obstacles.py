@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ CYLINDER, POLYGON = 1, 2  # autoware_perception_msgs/Shape.type, 0 is a bounding
 ORIENTATION_UNAVAILABLE = 0  # autoware_perception_msgs/TrackedObjectKinematics.orientation_availability
 VARIANCE_MIN, VARIANCE_MAX = 1e-6, 1e6  # [m^2], [m^2/s^2]; Autoware writes 1e9 for "no information"
 VARIANCE_UNKNOWN = 1e4  # of a velocity that a detection does not have
+MAX_NUMBER = 1e12  # of what enters arithmetic here: nothing overflows on the way to the bounds of the wire contract
 MAX_ID = 64
 
 _UPPER = np.triu_indices(6)
@@ -45,16 +47,16 @@ def frame_from_detections(message: Any, frame_ids: Collection[str]) -> ObstacleF
     detections = message.detections
     for header in (message.header, *(d.header for d in detections if d.header.frame_id)):
         _check_frame_id(header.frame_id, frame_ids)
-    stated = [d.results[0].pose.covariance if d.results else _NOTHING for d in detections]
-    covariances = _six_by_six(_position_blocks(stated), None)
+    stated = _linear([d.results[0].pose.covariance if d.results else _NOTHING for d in detections])
+    uppers = _uppers(stated.blocks, np.eye(3) * VARIANCE_UNKNOWN)
     obstacles = [
         Obstacle(
             id=_checked_id(d.id),
             position=_vec(d.bbox.center.position),
             radius=_half_diagonal(d.bbox.size),
-            covariance=covariance,
+            covariance=None if std is None else upper,
         )
-        for d, covariance in zip(detections, covariances, strict=True)
+        for d, upper, std in zip(detections, uppers, stated.stds, strict=True)
     ]
     return ObstacleFrame(stamp_ns=_stamp_ns(message.header), clock="unix", kind="detection", obstacles=obstacles)
 
@@ -72,24 +74,23 @@ def frame_from_tracked_objects(message: Any, frame_ids: Collection[str]) -> Obst
     motions = [o.kinematics for o in message.objects]
     oriented, rotations = _rotations(motions)
     twists = [m.twist_with_covariance for m in motions]
-    v_object = np.array([_vec(t.twist.linear) for t in twists]).reshape(-1, 3, 1)
-    velocities = (rotations @ v_object)[..., 0].tolist()
-    positions = _position_blocks([m.pose_with_covariance.covariance for m in motions])
-    in_object = _position_blocks([t.covariance for t in twists])
-    v_blocks = [None if block is None else r @ block @ r.T for r, block in zip(rotations, in_object, strict=True)]
-    covariances = _six_by_six(positions, v_blocks)
+    v_object = _bounded("twist", np.array([_vec(twist.twist.linear) for twist in twists]).reshape(-1, 3))
+    velocities = (rotations @ v_object[:, :, None])[..., 0].tolist()
+    p_stated = _linear([m.pose_with_covariance.covariance for m in motions])
+    v_stated = _linear([twist.covariance for twist in twists])
+    uppers = _uppers(p_stated.blocks, rotations @ v_stated.blocks @ np.swapaxes(rotations, 1, 2))
     obstacles = []
     for k, item in enumerate(message.objects):
-        p_block, v_block = positions[k], v_blocks[k] if oriented[k] else None
+        p_std, v_std = p_stated.stds[k], v_stated.stds[k] if oriented[k] else None
         obstacles.append(
             Obstacle(
                 id=_uuid(item.object_id.uuid),
                 position=_vec(motions[k].pose_with_covariance.pose.position),
                 radius=_shape_radius(item.shape),
                 velocity=tuple(velocities[k]) if oriented[k] else None,
-                covariance=covariances[k] if oriented[k] else None,
-                position_std=None if p_block is None else _largest_std(p_block),
-                velocity_std=None if v_block is None else _largest_std(v_block),
+                covariance=None if p_std is None or v_std is None else uppers[k],
+                position_std=p_std,
+                velocity_std=v_std,
             )
         )
     return ObstacleFrame(stamp_ns=_stamp_ns(message.header), clock="unix", kind="track", obstacles=obstacles)
@@ -110,6 +111,12 @@ def _stamp_ns(header: Any) -> int:
     if nanosec >= NS_PER_S:
         raise FrameRejected("malformed", f"header.stamp.nanosec: expected below {NS_PER_S}, got {nanosec}")
     return int(header.stamp.sec) * NS_PER_S + nanosec
+
+
+def _bounded(name: str, values: FloatArray) -> FloatArray:
+    if not (np.abs(values) <= MAX_NUMBER).all():  # false for what is not a number, too
+        raise FrameRejected("out_of_range", f"{name}: expected finite numbers within +-{MAX_NUMBER:g}")
+    return values
 
 
 def _vec(v: Any) -> Vec:
@@ -148,7 +155,7 @@ def _shape_radius(shape: Any) -> float:
 def _rotations(motions: Sequence[Any]) -> tuple[list[bool], FloatArray]:
     """Which objects state an orientation, and header_from_object of each as a matrix, (N, 3, 3)."""
     poses = [m.pose_with_covariance.pose.orientation for m in motions]
-    q = np.array([(o.w, o.x, o.y, o.z) for o in poses], dtype=np.float64).reshape(-1, 4)
+    q = _bounded("orientation", np.array([(o.w, o.x, o.y, o.z) for o in poses], dtype=np.float64).reshape(-1, 4))
     norm = np.sqrt(np.einsum("ni,ni->n", q, q))
     oriented = [
         not (m.orientation_availability == ORIENTATION_UNAVAILABLE and n == 0.0)
@@ -166,15 +173,24 @@ def _rotations(motions: Sequence[Any]) -> tuple[list[bool], FloatArray]:
     return oriented, np.moveaxis(np.array(rows), 2, 0)
 
 
-def _position_blocks(covariances: Sequence[Any]) -> list[FloatArray | None]:
-    """The linear 3x3 block of each row-major 6x6, made positive definite; None where no variance is stated.
+@dataclass(frozen=True, slots=True)
+class _Linear:
+    """Linear 3x3 blocks of N covariances, positive definite, and the deviation of the axis in which least is known.
+
+    ``stds`` is None where no variance is stated; the block means nothing there.
+    """
+
+    blocks: FloatArray  # (N, 3, 3)
+    stds: list[float | None]
+
+
+def _linear(covariances: Sequence[Any]) -> _Linear:
+    """The linear blocks of row-major 6x6 covariances.
 
     Raises:
         FrameRejected: a block that is not finite, or has a clearly negative eigenvalue.
     """
-    blocks = np.array(covariances, dtype=np.float64).reshape(-1, 6, 6)[:, :3, :3]
-    if not np.isfinite(blocks).all():
-        raise FrameRejected("out_of_range", "covariance: expected finite numbers")
+    blocks = _bounded("covariance", np.array(covariances, dtype=np.float64).reshape(-1, 6, 6)[:, :3, :3])
     diagonal = np.einsum("nii->ni", blocks)
     stated = diagonal > 0.0
     blocks = np.where(stated[:, :, None] & stated[:, None, :], 0.5 * (blocks + np.swapaxes(blocks, 1, 2)), 0.0)
@@ -183,26 +199,17 @@ def _position_blocks(covariances: Sequence[Any]) -> list[FloatArray | None]:
     values, vectors = np.linalg.eigh(blocks)
     if (values[:, :1] < -1e-6 * values[:, 2:]).any():
         raise FrameRejected("out_of_range", "covariance: expected no negative eigenvalue")
-    held = (vectors * np.clip(values, VARIANCE_MIN, VARIANCE_MAX)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    return [block if any_stated else None for block, any_stated in zip(held, stated.any(axis=1).tolist(), strict=True)]
+    values = np.clip(values, VARIANCE_MIN, VARIANCE_MAX)
+    stds = np.sqrt(values[:, 2]).tolist()
+    return _Linear(
+        (vectors * values[:, None, :]) @ np.swapaxes(vectors, 1, 2),
+        [std if known else None for std, known in zip(stds, stated.any(axis=1).tolist(), strict=True)],
+    )
 
 
-def _six_by_six(
-    positions: Sequence[FloatArray | None], velocities: Sequence[FloatArray | None] | None
-) -> list[list[float] | None]:
-    """Upper triangles over (position, velocity) where both are stated; ``velocities`` None: there are none at all."""
-    found: list[list[float] | None] = []
-    for k, position in enumerate(positions):
-        velocity = np.eye(3) * VARIANCE_UNKNOWN if velocities is None else velocities[k]
-        if position is None or velocity is None:
-            found.append(None)
-            continue
-        matrix = np.zeros((6, 6))
-        matrix[:3, :3], matrix[3:, 3:] = position, velocity
-        found.append(matrix[_UPPER].tolist())
+def _uppers(positions: FloatArray, velocities: FloatArray) -> list[list[float]]:
+    """Upper triangles of 6x6 over (position, velocity) from their (N, 3, 3) blocks, nothing between the two."""
+    matrices = np.zeros((len(positions), 6, 6))
+    matrices[:, :3, :3], matrices[:, 3:, 3:] = positions, velocities
+    found: list[list[float]] = matrices[:, _UPPER[0], _UPPER[1]].tolist()
     return found
-
-
-def _largest_std(block: FloatArray) -> float:
-    """Of the axis in which least is known."""
-    return math.sqrt(float(np.linalg.eigvalsh(block)[2]))
