@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import math
+import re
 import sys
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -373,3 +377,13 @@ def test_a_source_can_be_required_and_untrusted() -> None:
     name = source_name("/perception/object_recognition/tracking/objects")
     config = parse_config({"obstacles": {"required": [name]}, "tracking": {"untrusted": [name]}})
     assert config.tracking.untrusted == ("ros2-perception-object_recognition-tracking-objects",)
+
+
+def test_the_documentation_agrees_with_the_code() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "ros2.md").read_text(encoding="utf-8")
+    config = parse_config(tomllib.loads(re.search(r"```toml\n(.*?)```", text, re.S)[1]))
+    assert config.ros2.detections == ("/lidar/boxes",)
+    assert config.obstacles.required == (source_name(config.ros2.detections[0]),)
+    ast.parse(re.search(r"```python\n(.*?)```", text, re.S)[1])
+    for kind in (DETECTION_TYPE, TRACKED_TYPE):
+        assert f"| `{kind.dds_name}` | `{kind.type_hash}` |" in text
