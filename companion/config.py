@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from companion.config_check import check_arena, check_confirmation, check_reserve, check_tick, pointed
+from companion.config_check import check_arena, check_confirmation, check_reserve, check_ros2, check_tick, pointed
 from companion.errors import ConfigError
 from companion.profiles import PROFILES, Profile
 
@@ -23,6 +23,11 @@ Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]
 Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
+SourceName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,128}$")]
+Topic = Annotated[str, Meta(pattern=r"^/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$", max_length=120)]
+FrameId = Annotated[str, Meta(min_length=1, max_length=64)]
+TypeHash = Annotated[str, Meta(pattern=r"^RIHS01_[0-9a-f]{64}$")]
+KeyPrefix = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*)?$")]
 Stay = Annotated[float, Meta(gt=0.34, lt=1.0)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
@@ -68,6 +73,18 @@ class ObstaclesConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     queue: Annotated[int, Meta(ge=1, le=4096)] = 64
 
 
+class Ros2Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Topics of ROS 2 nodes on rmw_zenoh; off while none is named. Needs the extra ``ros2``."""
+
+    domain_id: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the nodes
+    detections: tuple[Topic, ...] = ()  # of vision_msgs/Detection3DArray
+    tracked_objects: tuple[Topic, ...] = ()  # of autoware_perception_msgs/TrackedObjects
+    frame_id: FrameId = "map"  # must be the vehicle's local ENU frame
+    other_frame_ids: tuple[FrameId, ...] = ()  # that coincide with it, such as "odom"
+    key_prefix: KeyPrefix = ""  # before the domain, where the nodes' session has a namespace
+    type_hashes: tuple[TypeHash, ...] = ()  # of releases known to be laid out as the current ones
+
+
 class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Process noises in physical units: 1-sigma of the white input of each model, per sqrt(Hz)."""
 
@@ -103,7 +120,7 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     confirm_hits: Annotated[int, Meta(ge=1, le=20)] = 2  # detections that confirm an anonymous track; 1: at once
     confirm_frames: Annotated[int, Meta(ge=1, le=100)] = 3  # of its source after the first in which they must come
     merge_s: Annotated[float, Meta(ge=0.0, le=60.0)] = 1.0  # tracks that agree for this long become one; 0: never
-    untrusted: tuple[Name, ...] = ()  # sources that may add obstacles but never move or end those of others
+    untrusted: tuple[SourceName, ...] = ()  # sources that may add obstacles but never move or end those of others
 
 
 class PolicyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -179,6 +196,7 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     target: TargetConfig = TargetConfig()
     engage: EngageConfig = EngageConfig()
     obstacles: ObstaclesConfig = ObstaclesConfig()
+    ros2: Ros2Config = Ros2Config()
     tracking: TrackingConfig = TrackingConfig()
     policy: PolicyConfig = PolicyConfig()
     safety: SafetyConfig = SafetyConfig()
@@ -266,6 +284,7 @@ def parse_config(raw: Mapping[str, Any], *, source: str = "configuration") -> Co
         check_reserve(config.limits.acceleration_m_s2, config.disturbance.bound_m_s2, source)
     check_confirmation(config.tracking.confirm_hits, config.tracking.confirm_frames, source)
     check_arena(config.limits.arena_min, config.limits.arena_max, config.target.position, source)
+    check_ros2((*config.ros2.detections, *config.ros2.tracked_objects), config.sync, source)
     if config.sync == "none" and config.lockstep_sources:
         raise ConfigError(f'{source}: lockstep_sources: expected only with sync = "lockstep"')
     return config

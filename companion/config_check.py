@@ -52,3 +52,13 @@ def check_reserve(acceleration_m_s2: float, bound_m_s2: float, source: str) -> N
             f"{source}: limits.acceleration_m_s2: expected more than disturbance.bound_m_s2 = {bound_m_s2}, "
             f"got {acceleration_m_s2}"
         )
+
+
+def check_ros2(topics: tuple[str, ...], sync: str, source: str) -> None:
+    """Raise ConfigError for a topic named twice, and in lockstep: ROS stamps are unix time, which lockstep has not."""
+    names = [topic.strip("/") for topic in topics]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"{source}: ros2: expected each topic once, got /{name} {names.count(name)} times")
+    if names and sync == "lockstep":
+        raise ConfigError(f'{source}: ros2: expected no topics with sync = "lockstep"')

@@ -10,7 +10,7 @@ import numpy as np
 from companion.config import Config, config_hash
 from companion.errors import FrameRejected
 from companion.frames import enu_from_ned
-from companion.link import ingress, wire
+from companion.link import ingress, ros2, wire
 from companion.link.inbox import ObstacleInbox
 from companion.link.zenoh import ZenohHandlers
 from companion.metrics import TickMeter
@@ -27,6 +27,8 @@ class Doors:
         now_ns: the time base of the session.
         on_vehicle: called with each vehicle state that came by Zenoh.
         on_change: called after anything that may let the control task go on.
+    Raises:
+        ConfigError: topics of ROS 2 are configured and cannot be read here.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class Doors:
         self._now_ns = now_ns
         self._on_vehicle = on_vehicle
         self._on_change = on_change
+        self._ros2 = ros2.subscriptions(config.ros2, inbox)
 
     def handlers(self) -> ZenohHandlers:
         lockstep = self._config.sync == "lockstep"
@@ -62,6 +65,7 @@ class Doors:
             on_marker=self._marker if lockstep else None,
             on_vehicle=self._vehicle if by_zenoh else None,
             on_rejected=self._inbox.reject,
+            extra=self._ros2,
         )
 
     def target(self, command: wire.TargetCommand) -> wire.Reply:

@@ -19,10 +19,13 @@ from companion.types import NS_PER_S, DetectionFrame
 MAX_PAYLOAD_BYTES = 1 << 20
 MAX_SOURCES = 64
 
+# bytes as they came, a frame that another door decoded, or the call that decodes it
+Payload = bytes | wire.ObstacleFrame | Callable[[], wire.ObstacleFrame]
+
 
 @dataclass(slots=True)
 class _Source:
-    queue: deque[tuple[int, bytes, str | None]] = field(default_factory=deque)  # (sequence, payload, encoding)
+    queue: deque[tuple[int, Payload, str | None]] = field(default_factory=deque)  # (sequence, payload, encoding)
     arrived: int = 0  # frames so far; the next one's sequence
     announced: int = 0  # frames that the markers so far stand for
     through_ns: int | None = None  # of the newest marker
@@ -62,12 +65,22 @@ class ObstacleInbox:
 
     def push(self, source: str, payload: bytes, encoding: str | None = None) -> None:
         """One frame as it arrived; never raises."""
+        self._enqueue(source, payload, encoding)
+
+    def push_decoded(self, source: str, frame: wire.ObstacleFrame | Callable[[], wire.ObstacleFrame]) -> None:
+        """One frame of another door, or the call that decodes it when a tick drains it; never raises.
+
+        The call may raise FrameRejected, which is counted like any other.
+        """
+        self._enqueue(source, frame, None)
+
+    def _enqueue(self, source: str, payload: Payload, encoding: str | None) -> None:
         entry = self._source(source)
         if entry is None:
             self.reject(source, FrameRejected("too_many_sources", f"expected at most {MAX_SOURCES} sources"))
             return
         sequence, entry.arrived = entry.arrived, entry.arrived + 1
-        if len(payload) > MAX_PAYLOAD_BYTES:
+        if isinstance(payload, bytes) and len(payload) > MAX_PAYLOAD_BYTES:
             detail = f"expected at most {MAX_PAYLOAD_BYTES} bytes, got {len(payload)}"
             self.reject(source, FrameRejected("too_large", detail))
             return
@@ -133,7 +146,7 @@ class ObstacleInbox:
                 sequence, payload, encoding = entry.queue.popleft()
                 try:
                     frame = ingress.detections_from_frame(
-                        wire.decode(payload, wire.ObstacleFrame, encoding),
+                        _decoded(payload, encoding),
                         source=name,
                         sequence=sequence,
                         now_ns=now_ns,
@@ -192,3 +205,9 @@ class ObstacleInbox:
         self._on_report(f"rejected {self._unreported} payloads, the last of {self._last_rejection}")
         self._unreported = 0
         self._reported_ns = now_ns
+
+
+def _decoded(payload: Payload, encoding: str | None) -> wire.ObstacleFrame:
+    if isinstance(payload, bytes):
+        return wire.decode(payload, wire.ObstacleFrame, encoding)
+    return payload if isinstance(payload, wire.ObstacleFrame) else payload()

@@ -17,8 +17,8 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import zenoh
@@ -41,6 +41,7 @@ class ZenohHandlers:
     ``on_target``, ``on_engage``: the decoded command; the reply answers a query and is dropped for a put.
     ``config``, ``health``: the JSON that answers ``companion/config`` and ``companion/health``.
     ``on_rejected``: a put or query that could not be decoded.
+    ``extra``: handlers of other doors by key expression, whole and outside the prefix; they get the whole key.
     """
 
     on_obstacles: OnPayload
@@ -51,6 +52,7 @@ class ZenohHandlers:
     on_marker: OnPayload | None = None  # lockstep only
     on_vehicle: Callable[[bytes, str], None] | None = None  # vehicle.source = "zenoh" only
     on_rejected: Callable[[str, FrameRejected], None] = lambda key, error: None
+    extra: Mapping[str, OnPayload] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +187,8 @@ class ZenohLink:
         if handlers.on_vehicle is not None:
             on_vehicle = handlers.on_vehicle
             self._subscribe("vehicle/state", lambda _, payload, encoding: on_vehicle(payload, encoding))
+        for key_expression, handler in handlers.extra.items():
+            self._listen(key_expression, handler, str)
         self._command("target", wire.TargetCommand, handlers.on_target)
         self._command("engage", wire.EngageCommand, handlers.on_engage)
         self._queryable("companion/config", lambda _payload, _encoding: handlers.config())
@@ -194,16 +198,20 @@ class ZenohLink:
 
     def _subscribe(self, key: str, handler: OnPayload) -> None:
         """``handler`` gets the last chunk of the key (the source), the payload and its media type."""
+        self._listen(f"{self._prefix}/{key}", handler, lambda name: name.rpartition("/")[2])
+
+    def _listen(self, key_expression: str, handler: OnPayload, told: Callable[[str], str]) -> None:
+        """``handler`` gets what ``told`` makes of the key, the payload and its media type."""
 
         def received(sample: zenoh.Sample) -> None:
             if len(sample.payload) > MAX_PAYLOAD_BYTES:
                 self.counts["too_large"] += 1
                 return
-            source = str(sample.key_expr).rpartition("/")[2]
+            source = told(str(sample.key_expr))
             payload, encoding = sample.payload.to_bytes(), str(sample.encoding)
             self._hand_over(lambda: handler(source, payload, encoding))
 
-        self._declared.append(self._session.declare_subscriber(f"{self._prefix}/{key}", received))
+        self._declared.append(self._session.declare_subscriber(key_expression, received))
 
     def _command(self, key: str, kind: type[wire.T], handler: Callable[[wire.T], wire.Reply]) -> None:
         def answer(payload: bytes, encoding: str) -> bytes:

@@ -42,7 +42,7 @@ BRAIN = (
 )
 NOT_IN_BRAIN = {"asyncio", "socket", "time", "random", "os", "logging", "threading", "datetime"}
 HEAVY = {"torch", "pybullet", "matplotlib", "filterpy", "mavsdk", "stable_baselines3", "gymnasium"}
-HEAVY |= {"cbfpy", "jax", "quadprog"}
+HEAVY |= {"cbfpy", "jax", "quadprog", "rosbags"}
 
 
 def modules(folder: str) -> list[Path]:

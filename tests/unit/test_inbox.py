@@ -7,6 +7,7 @@ import json
 
 import pytest
 
+from companion.errors import FrameRejected
 from companion.link import wire
 from companion.link.inbox import MAX_PAYLOAD_BYTES, MAX_SOURCES, ObstacleInbox
 
@@ -196,3 +197,31 @@ def test_the_newest_complete_tick_needs_every_source(inbox: ObstacleInbox) -> No
     inbox.push("b", frame(20 * MS))
     assert inbox.complete_through_ns(("a", "b")) == 50 * MS
     assert inbox.complete_through_ns(("a",)) == 100 * MS
+
+
+def test_frames_of_other_doors_queue_with_the_rest_and_are_decoded_when_drained() -> None:
+    inbox = ObstacleInbox(queue=2, max_age_s=0.5)
+    calls: list[int] = []
+
+    def decoded(stamp_ns: int) -> wire.ObstacleFrame:
+        return wire.ObstacleFrame(stamp_ns=stamp_ns, clock="vehicle", kind="track", obstacles=[])
+
+    def later(stamp_ns: int) -> wire.ObstacleFrame:
+        calls.append(stamp_ns)
+        return decoded(stamp_ns)
+
+    def broken() -> wire.ObstacleFrame:
+        raise FrameRejected("frame_id", "expected map")
+
+    inbox.push("a", frame(10 * MS))
+    inbox.push_decoded("a", decoded(20 * MS))
+    inbox.push_decoded("a", lambda: later(30 * MS))
+    inbox.push_decoded("b", broken)
+    for number in range(MAX_SOURCES):
+        inbox.push_decoded(f"stranger{number}", decoded(0))
+    assert calls == []
+    frames = [f for f in inbox.drain(40 * MS) if f.source in "ab"]
+    assert [(f.sequence, f.stamp_ns) for f in frames] == [(1, 20 * MS), (2, 30 * MS)]
+    assert calls == [30 * MS]
+    expected = {"dropped": 1, "frame_id": 1, "too_many_sources": 2, "frames": 2 + MAX_SOURCES - 2}
+    assert inbox.counts == expected
