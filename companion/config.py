@@ -164,6 +164,10 @@ class DisturbanceConfig(Section, frozen=True, kw_only=True, forbid_unknown_field
     bound_m_s2: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.3
 
 
+class ParamsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    file: str | None = None  # live parameters that an operator has stored, beside this file; None: none can be
+
+
 class LogConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     directory: str | None = None  # None: no log
 
@@ -186,6 +190,7 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     delay: DelayConfig = DelayConfig()
     disturbance: DisturbanceConfig = DisturbanceConfig()
     log: LogConfig = LogConfig()
+    params: ParamsConfig = ParamsConfig()
 
     @property
     def profile(self) -> Profile:
@@ -279,7 +284,11 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> Config:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}), expected a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not TOML: {error}") from None
-    return parse_config(apply_overrides(raw, overrides), source=str(path))
+    config = parse_config(apply_overrides(raw, overrides), source=str(path))
+    if config.params.file is not None:  # a relative name lies beside the configuration, wherever the daemon is started
+        params = msgspec.structs.replace(config.params, file=str(path.parent / config.params.file))
+        config = msgspec.structs.replace(config, params=params)
+    return config
 
 
 def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str, Any]:
@@ -303,7 +312,8 @@ def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str
 
 
 def config_hash(config: Config) -> str:
-    """SHA-256 of the resolved configuration, log directory left out (it does not change the flight)."""
+    """SHA-256 of the resolved configuration; where files lie is left out (it does not change the flight)."""
     values = msgspec.to_builtins(config)
     values.pop("log")
+    values.pop("params")
     return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()
