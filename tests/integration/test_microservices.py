@@ -186,7 +186,7 @@ def test_an_obstacle_on_a_collision_course_is_announced_once_a_second() -> None:
             autopilot.received.clear()
             first = autopilot.tick
             for _ in range(50):  # a ball comes down on the vehicle, which hovers at (0, 0, 2)
-                height = 6.0 - 0.05 * (autopilot.tick - first)
+                height = 4.0 - 0.05 * (autopilot.tick - first)
                 ball = {"id": "ball", "position": [0.1, 0.0, height], "radius": 0.2, "position_std": 0.05}
                 stamp_ns = 50_000_000 * (autopilot.tick + 1)
                 frames.put(json.dumps({"stamp_ns": stamp_ns, "clock": "vehicle", "obstacles": [ball]}))
