@@ -21,6 +21,7 @@ from companion.profiles import PROFILES, Profile
 
 Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]
+Acceleration = Annotated[float, Meta(gt=0.0, le=1e3)]  # what a setpoint on the wire may hold
 Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
 Stay = Annotated[float, Meta(gt=0.34, lt=1.0)]
@@ -144,7 +145,7 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class LimitsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    acceleration_m_s2: Positive = 3.0  # each axis, net of gravity
+    acceleration_m_s2: Acceleration = 3.0  # each axis, net of gravity
     norm_m_s2: Positive | None = None  # of the whole net acceleration
     tilt_deg: Annotated[float, Meta(gt=0.0, lt=90.0)] | None = 45.0  # of the thrust (PX4: MPC_TILTMAX_AIR)
     slew_m_s3: Positive | None = None  # each axis, how fast a setpoint may change

@@ -8,7 +8,7 @@ import pytest
 from companion.config import Config, parse_config
 from companion.errors import ConfigError
 from companion.pilot import Pilot, PilotInput, PilotOutput
-from companion.tunables import changed
+from companion.tunables import TUNABLES, Tunable, changed
 from companion.types import Detection, DetectionFrame, DetectionKind, VehicleState, frozen
 
 TICK_NS = 50_000_000
@@ -94,3 +94,22 @@ def test_what_shapes_the_state_cannot_be_retuned() -> None:
     for raw in ({"safety": {"horizon": 10}}, {"tracking": {"coast_s": 2.0}}, {"delay": {"loop_s": 0.1}}):
         with pytest.raises(ConfigError, match="live parameters only"):
             pilot.retune(parse_config(raw))
+
+
+@pytest.mark.parametrize("tunable", TUNABLES, ids=lambda tunable: tunable.name)
+def test_no_value_that_is_accepted_makes_the_brain_fail(tunable: Tunable) -> None:
+    """FAULT in flight because of a typing error would be worse than the typing error."""
+    bounds, smallest = tunable.bounds, 1.401298464324817e-45  # of the float32 above 0
+    accepted = 0
+    for value in (bounds.low, bounds.low + smallest, 1e-3, 1.0, 1e3, bounds.high - 1.0, bounds.high):
+        pilot = Pilot(Config())
+        fly(pilot, 1, 6)
+        try:
+            pilot.retune(changed(Config(), {tunable.name: value}))
+        except ConfigError:
+            continue
+        accepted += 1
+        for output in fly(pilot, 6, 12):
+            assert np.isfinite(output.wire).all()
+            assert np.abs(output.wire).max() <= max(3.0, value) + 1e-9
+    assert accepted >= 2

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from companion.config import Config, parse_config
 from companion.errors import ConfigError
+from companion.link.mavlink import MavlinkCodec
 from companion.tunables import (
     BY_NAME,
     TUNABLES,
@@ -99,3 +101,9 @@ def test_a_float32_comes_back_as_the_decimal_that_was_typed() -> None:
 def test_the_page_is_the_table() -> None:
     """docs/parameters.md is generated; it must not drift from the code."""
     assert reference() in (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8")
+
+
+def test_the_largest_acceleration_is_one_that_can_be_sent() -> None:
+    """A setpoint that the wire refuses means FAULT."""
+    largest = BY_NAME["CA_ACC_MAX"].bounds.high
+    assert MavlinkCodec(system=1).encode_setpoint(0, np.full(3, largest), 0x0C3F)
