@@ -21,6 +21,7 @@ from companion.profiles import PROFILES, Profile
 
 Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]
+Acceleration = Annotated[float, Meta(gt=0.0, le=1e3)]  # what a setpoint on the wire may hold
 Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
 SourceName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,128}$")]
@@ -161,7 +162,7 @@ class SafetyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class LimitsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    acceleration_m_s2: Positive = 3.0  # each axis, net of gravity
+    acceleration_m_s2: Acceleration = 3.0  # each axis, net of gravity
     norm_m_s2: Positive | None = None  # of the whole net acceleration
     tilt_deg: Annotated[float, Meta(gt=0.0, lt=90.0)] | None = 45.0  # of the thrust (PX4: MPC_TILTMAX_AIR)
     slew_m_s3: Positive | None = None  # each axis, how fast a setpoint may change
@@ -179,6 +180,10 @@ class DisturbanceConfig(Section, frozen=True, kw_only=True, forbid_unknown_field
     enabled: bool = True
     bandwidth_hz: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
     bound_m_s2: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.3
+
+
+class ParamsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    file: str | None = None  # live parameters that an operator has stored, beside this file; None: none can be
 
 
 class LogConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -204,6 +209,7 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     delay: DelayConfig = DelayConfig()
     disturbance: DisturbanceConfig = DisturbanceConfig()
     log: LogConfig = LogConfig()
+    params: ParamsConfig = ParamsConfig()
 
     @property
     def profile(self) -> Profile:
@@ -298,7 +304,11 @@ def load_config(path: Path, overrides: tuple[str, ...] = ()) -> Config:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}), expected a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not TOML: {error}") from None
-    return parse_config(apply_overrides(raw, overrides), source=str(path))
+    config = parse_config(apply_overrides(raw, overrides), source=str(path))
+    if config.params.file is not None:  # a relative name lies beside the configuration, wherever the daemon is started
+        params = msgspec.structs.replace(config.params, file=str(path.parent / config.params.file))
+        config = msgspec.structs.replace(config, params=params)
+    return config
 
 
 def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str, Any]:
@@ -322,7 +332,8 @@ def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str
 
 
 def config_hash(config: Config) -> str:
-    """SHA-256 of the resolved configuration, log directory left out (it does not change the flight)."""
+    """SHA-256 of the resolved configuration; where files lie is left out (it does not change the flight)."""
     values = msgspec.to_builtins(config)
     values.pop("log")
+    values.pop("params")
     return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()

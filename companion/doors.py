@@ -53,6 +53,10 @@ class Doors:
         self._on_change = on_change
         self._ros2 = ros2.subscriptions(config.ros2, inbox)
 
+    def retune(self, config: Config) -> None:
+        """What the configuration query answers from now on."""
+        self._config = config
+
     def handlers(self) -> ZenohHandlers:
         lockstep = self._config.sync == "lockstep"
         by_zenoh = self._config.vehicle.source == "zenoh"

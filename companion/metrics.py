@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,26 @@ class TickMeter:
             "p99.9": round(float(p999), 4),
             "max": round(max(values), 4),
         }
+
+    def counts(self, groups: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
+        """Everything counted, by kind: the verdicts, what ``groups`` hold, the deadlines."""
+        kinds = {"verdict": self.verdicts, **groups}
+        counted = {f"{kind}.{name}": count for kind, group in kinds.items() for name, count in sorted(group.items())}
+        return {**counted, "deadline_misses": self.deadline_misses, "states_skipped": self.states_skipped}
+
+    def summary(self, counts: dict[str, int], final_state: str, *, log: str | None, log_hash: str) -> Summary:
+        """What the run amounted to."""
+        return Summary(
+            ticks=self.ticks,
+            verdicts=dict(self.verdicts),
+            tick_ms=self.quantiles_ms(),
+            deadline_misses=self.deadline_misses,
+            states_skipped=self.states_skipped,
+            counts=counts,
+            final_state=final_state,
+            log=log,
+            log_hash=log_hash,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,10 +15,11 @@ import numpy as np
 
 from companion.config import Config
 from companion.disturbance import DisturbanceObserver
-from companion.errors import BrainFailure, PolicyOutputInvalid
-from companion.policy import brake, hold, load_policy
+from companion.errors import BrainFailure, ConfigError, PolicyOutputInvalid
+from companion.policy import Policy, brake, hold, load_policy
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.tracking.tracker import Tracker
+from companion.tunables import only_tunables_differ
 from companion.types import (
     NS_PER_S,
     DetectionFrame,
@@ -109,6 +110,21 @@ class Pilot:
         self._ahead: tuple[int, Prediction] | None = None  # what `observe` has prepared
         self._anchor: Vec3 | None = None
         self._task: Task | None = None
+
+    def retune(self, config: Config) -> None:
+        """Fly on under ``config`` from the next step: other margins and limits, the same tracks and state.
+
+        Raises:
+            ConfigError: more than live parameters differs, or the policy asks for more acceleration than the new
+                limit; nothing has changed then.
+        """
+        if not only_tunables_differ(self._config, config):
+            raise ConfigError("retune: expected a configuration that differs in live parameters only")
+        if isinstance(self._policy, Policy):
+            self._policy = self._policy.within(config.limits)
+        self._config = config
+        self._tracker.retune(config.safety.drone_radius_m)
+        self._filter.retune(config.safety, config.limits)
 
     def tracks(self) -> TrackTable:
         """The tracks as the last step left them; apart from it, because nobody waits for them."""

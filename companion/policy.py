@@ -128,6 +128,15 @@ class Policy:
             a_enu = (1.0 - w) * a_enu + w * hold(error_enu, v_enu, self._config, self._limit_m_s2)
         return a_enu
 
+    def within(self, limits: LimitsConfig) -> Policy:
+        """The same network under other limits.
+
+        Raises:
+            ArtifactError: it asks for more than they allow.
+        """
+        check_limits(self.manifest, limits, self.manifest.name)
+        return Policy(self.manifest, self.digest, self._network, self._config, limits)
+
     def action(self, v_enu: Vec3, error_enu: Vec3) -> Vec3:
         """The network alone: pi([v, e]) in [-1, 1]^3, float64."""
         (vx, vy, vz), (ex, ey, ez) = v_enu.tolist(), error_enu.tolist()
@@ -149,11 +158,7 @@ def load_policy(config: PolicyConfig, limits: LimitsConfig) -> Policy:
     folder = artifact_folder(config.artifact)
     manifest, digest = read_manifest(folder)
     check_contract(manifest, folder)
-    if manifest.k_ma_m_s2 > limits.acceleration_m_s2 + 1e-9:
-        raise ArtifactError(
-            f"{folder / MANIFEST}: k_ma_m_s2: expected at most limits.acceleration_m_s2 "
-            f"{limits.acceleration_m_s2}, got {manifest.k_ma_m_s2}"
-        )
+    check_limits(manifest, limits, folder / MANIFEST)
     if config.backend == "torch":
         from companion.torch_backend import load_network
 
@@ -184,6 +189,15 @@ def read_manifest(folder: Path) -> tuple[Manifest, str]:
         return msgspec.json.decode(data, type=Manifest), hashlib.sha256(data).hexdigest()
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ArtifactError(f"{folder / MANIFEST}: {error}") from None
+
+
+def check_limits(manifest: Manifest, limits: LimitsConfig, source: Path | str) -> None:
+    """Refuse a policy that was made for a stronger vehicle."""
+    if manifest.k_ma_m_s2 > limits.acceleration_m_s2 + 1e-9:
+        raise ArtifactError(
+            f"{source}: k_ma_m_s2: expected at most limits.acceleration_m_s2 "
+            f"{limits.acceleration_m_s2}, got {manifest.k_ma_m_s2}"
+        )
 
 
 def check_contract(manifest: Manifest, folder: Path) -> None:

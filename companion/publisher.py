@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 
 import msgspec
 
+from companion.config import Config
 from companion.link import wire
 from companion.link.zenoh import ZenohLink
 from companion.metrics import TickMeter
@@ -75,6 +76,11 @@ class Publisher:
             self._zenoh.put_encoded(key, payload)
         if self._recorder is not None:
             self._recorder.message(f"/{key}", stamp_ns, payload)
+
+    def retuned(self, config: Config, stamp_ns: int) -> None:
+        """Other live parameters from here on: the log says which."""
+        if self._recorder is not None:
+            self._recorder.config(config, stamp_ns)
 
     def keep_log(self, now_ns: int) -> str | None:
         """Flush the log once a second; why it is not written any more, or None."""

@@ -1,8 +1,9 @@
 """The log of a flight: an MCAP file of JSON messages with named JSON Schemas, which Foxglove and `mcap` open.
 
-Topics: ``/companion/config`` (resolved configuration, its hash and versions, first), ``/companion/input/obstacles``
-(frames as the brain consumed them, vehicle clock, ENU), ``/companion/vehicle``, ``/companion/setpoint``,
-``/companion/tracks``, ``/companion/status``. Times are nanoseconds of the vehicle's clock.
+Topics: ``/companion/config`` (resolved configuration, its hash and version: first, and again when live parameters
+change), ``/companion/input/obstacles`` (frames as the brain consumed them, vehicle clock, ENU),
+``/companion/vehicle``, ``/companion/setpoint``, ``/companion/tracks``, ``/companion/status``. Times are nanoseconds
+of the vehicle's clock.
 """
 
 from __future__ import annotations
@@ -49,13 +50,17 @@ class Recorder:
         self._open = True
         self._writer: Any = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         self._channels: dict[str, int] = {}
-        head = {"version": __version__, "hash": config_hash(config), "config": msgspec.to_builtins(config)}
         try:
             self._start()
         except OSError as error:
             self._fail(error)
-        self.message("/companion/config", 0, _ENCODER.encode(head))
+        self.config(config, 0)
         self.flush()
+
+    def config(self, config: Config, stamp_ns: int) -> None:
+        """Append the resolved configuration that holds from here on."""
+        head = {"version": __version__, "hash": config_hash(config), "config": msgspec.to_builtins(config)}
+        self.message("/companion/config", stamp_ns, _ENCODER.encode(head))
 
     def message(self, topic: str, stamp_ns: int, payload: bytes) -> None:
         """Append one JSON message."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from companion.config import LimitsConfig, TargetConfig
+from companion.errors import ConfigError
 from companion.types import Vec3, frozen
 
 PASSED_M = 0.3  # a waypoint that is not the last counts as passed within this
@@ -25,6 +26,17 @@ class Route:
     def current(self) -> Vec3 | None:
         """The waypoint flown to now, ENU [m]; None: hold where engaged."""
         return self._waypoints[0] if self._waypoints else None
+
+    def retune(self, limits: LimitsConfig) -> None:
+        """Another arena for every target to come; ask `check` before."""
+        self._limits = limits
+
+    def check(self, limits: LimitsConfig) -> None:
+        """Raise ConfigError where a waypoint of this route would lie outside the arena of ``limits``."""
+        low, high = np.array(limits.arena_min), np.array(limits.arena_max)
+        for waypoint in self._waypoints:
+            if (waypoint < low).any() or (waypoint > high).any():
+                raise ConfigError(f"limits.arena: expected the target {waypoint.tolist()} inside")
 
     def advance(self, p_enu: Vec3) -> None:
         """Drop the current waypoint once it is reached and another follows."""

@@ -20,16 +20,19 @@ from companion.link import mav
 from companion.link.events import TimesyncReply, TimesyncRequest
 from companion.link.inbox import ObstacleInbox
 from companion.link.mavlink import MavlinkCodec, packet_count
+from companion.link.params import ParamRequest
 from companion.link.transports import Transport, open_transport
 from companion.link.zenoh import ZenohLink
 from companion.metrics import Summary, TickMeter
+from companion.microservices import Microservices
+from companion.parameters import with_stored
 from companion.pilot import Pilot, PilotOutput
 from companion.publisher import Publisher
 from companion.record import Recorder
 from companion.report import setpoint_record
 from companion.route import Route
 from companion.session import VehicleSession
-from companion.state import FLYING, State
+from companion.state import FLYING
 from companion.thinker import Thinker
 from companion.timebase import TimeBase
 from companion.types import NS_PER_S, VehicleState
@@ -42,18 +45,12 @@ STALL_NS = NS_PER_S  # lockstep: no progress for this much wall time ends the ru
 WAKE_S = 0.2  # of wall time: heartbeats, timeouts and the stall guard need no telemetry
 RELEASE_NS = 6 * NS_PER_S // 10  # on shutdown in flight the autopilot is given this long to show its hold mode
 
-_SYSTEM_STATUS = {
-    State.WAITING: mav.STATE_BOOT,
-    State.READY: mav.STATE_STANDBY,
-    State.OVERRIDDEN: mav.STATE_STANDBY,
-    State.FAULT: mav.STATE_CRITICAL,
-}
-
 
 class Service:
     """One vehicle, one brain. ``run`` returns after ``stop``, and raises whatever else ended it."""
 
     def __init__(self, config: Config, clock: Clock, *, pilot: Pilot | None = None) -> None:
+        base, config = config, with_stored(config)
         self._config = config
         self._clock = clock
         self._lockstep = config.sync == "lockstep"
@@ -79,6 +76,9 @@ class Service:
             now_ns=self._now_ns,
             on_vehicle=self._on_vehicle,
             on_change=self._on_change,
+        )
+        self._services = Microservices(
+            base, config, self._codec, self._session, clock, send=self._send, retune=self._retune
         )
         self._wake = asyncio.Event()
         self._stopping = False
@@ -218,6 +218,7 @@ class Service:
         state = session.situation.state
         record = setpoint_record(vehicle.stamp_ns, state, output, sent=sent, messages=messages, timings_ms=timings_ms)
         self._publisher.tick(record, state, vehicle, taken.frames, output, self._thinker.tracks)
+        self._services.note(vehicle, output)
         busy_ms = (stopwatch_ns() - started_ns) / 1e6
         self._meter.tick(timings_ms["total"], busy_ms, record.verdict)
 
@@ -240,11 +241,11 @@ class Service:
         if not self._lockstep:
             self._session.poll(now_ns)
             self._time.poll()
-        state = self._session.situation.state
         last = self._last_beat
         if last is None or now_ns - last[0] >= HEARTBEAT_NS or wall_ns - last[1] >= HEARTBEAT_NS:
             self._last_beat = (now_ns, wall_ns)
-            self._transport.send(self._codec.encode_heartbeat(_SYSTEM_STATUS.get(state, mav.STATE_ACTIVE)))
+            self._send(self._services.heartbeat())
+        self._services.poll()
         self._flush()
         self._publish_status(now_ns)
         self._keep_log(now_ns)
@@ -279,29 +280,13 @@ class Service:
 
     def _counts(self) -> dict[str, int]:
         """Everything counted, by kind."""
-        meter = self._meter
-        return {
-            **{f"verdict.{name}": count for name, count in sorted(meter.verdicts.items())},
-            **{f"obstacles.{name}": count for name, count in sorted(self._inbox.counts.items())},
-            **{f"tracking.{name}": count for name, count in sorted(self._thinker.tracking_counts.items())},
-            **{f"mavlink.{name}": count for name, count in sorted(self._codec.counts.items())},
-            "deadline_misses": meter.deadline_misses,
-            "states_skipped": meter.states_skipped,
-        }
+        groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
+        return self._meter.counts({**groups, "mavlink": self._codec.counts, "texts": self._session.text_counts})
 
     def _summary(self, recorder: Recorder | None) -> Summary:
-        meter = self._meter
-        return Summary(
-            ticks=meter.ticks,
-            verdicts=dict(meter.verdicts),
-            tick_ms=meter.quantiles_ms(),
-            deadline_misses=meter.deadline_misses,
-            states_skipped=meter.states_skipped,
-            counts=self._counts(),
-            final_state=self._session.situation.state.value,
-            log=None if recorder is None else str(recorder.path),
-            log_hash=self._publisher.log_hash,
-        )
+        log_path = None if recorder is None else str(recorder.path)
+        state = self._session.situation.state.value
+        return self._meter.summary(self._counts(), state, log=log_path, log_hash=self._publisher.log_hash)
 
     # what the links hand in
 
@@ -310,6 +295,8 @@ class Service:
         for event in self._codec.receive(data):
             if isinstance(event, TimesyncRequest | TimesyncReply):
                 self._time.handle(event, self._session.system)
+            elif isinstance(event, ParamRequest):
+                self._services.handle(event)
             elif (vehicle := self._session.handle(event, self._now_ns())) is not None:
                 self._on_vehicle(vehicle)
         self._flush()
@@ -343,6 +330,16 @@ class Service:
         self._vehicle_ns = 0
         self._thinker.reset()
         self._session.rebooted()
+
+    def _retune(self, config: Config) -> None:
+        """Other live parameters, between two ticks: all of them or, with ConfigError, none."""
+        self._route.check(config.limits)
+        self._thinker.retune(config)
+        self._route.retune(config.limits)
+        self._inbox.retune(config.obstacles.max_age_s)
+        self._session.retune(config)
+        self._doors.retune(config)
+        self._publisher.retuned(config, self._vehicle_ns)
 
     def _on_change(self) -> None:
         """A command or a marker came by Zenoh: answer the autopilot and look again."""

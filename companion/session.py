@@ -6,6 +6,7 @@ the monotonic clock otherwise; only differences of it are used.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from companion.link.events import Event as LinkEvent
 from companion.link.mavlink import MavlinkCodec
 from companion.profiles import ModeRequest
 from companion.state import FLYING, Event, Situation, State, advance, refusal
+from companion.texts import TextGate
 from companion.types import NS_PER_S, Vec3, VehicleState
 
 REPEAT_NS = NS_PER_S // 2  # mode requests
@@ -62,6 +64,8 @@ class VehicleSession:
         self._failed_ns = 0
         self._told: tuple[State, str] | None = None
         self._outgoing: list[bytes] = []
+        self._texts = TextGate()
+        self.commands: dict[int, Callable[[Command], int]] = {}  # MAV_CMD -> handler; it answers a MAV_RESULT
 
     # what others ask
 
@@ -76,6 +80,15 @@ class VehicleSession:
         if self._config.mode == "monitor" or self._system is None:
             return False
         return state in FLYING or (state is State.READY and self._profile.streams_when_ready)
+
+    @property
+    def text_counts(self) -> Counter[str]:
+        """STATUSTEXTs that were repeated or dropped."""
+        return self._texts.counts
+
+    def retune(self, config: Config) -> None:
+        """Time-outs of ``config`` from now on."""
+        self._config = config
 
     def take_outgoing(self) -> list[bytes]:
         """Messages to send since the last call, in order."""
@@ -111,8 +124,8 @@ class VehicleSession:
         self._failed_ns = now_ns
 
     def say(self, severity: int, text: str) -> None:
-        """A STATUSTEXT for the operator."""
-        self._outgoing.append(self._codec.encode_statustext(severity, text))
+        """A STATUSTEXT for the operator: at the next `poll`, not twice in a row, never a flood."""
+        self._texts.push(severity, text)
 
     def rebooted(self) -> None:
         """The autopilot began anew: it forgot which messages it was asked for."""
@@ -159,6 +172,7 @@ class VehicleSession:
         self._run_requests(now_ns)
         self._ask_intervals(now_ns)
         self._tell()
+        self._outgoing += [self._codec.encode_statustext(*said) for said in self._texts.take(now_ns)]
 
     # details
 
@@ -233,6 +247,8 @@ class VehicleSession:
                 result = mav.RESULT_ACCEPTED
         elif command.command == mav.CMD_DO_REPOSITION:
             result = self._reposition(command)
+        elif command.command in self.commands:
+            result = self.commands[command.command](command)
         self._outgoing.append(self._codec.encode_command_ack(command, result))
 
     def _reposition(self, command: Command) -> int:

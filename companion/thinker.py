@@ -53,6 +53,11 @@ class Thinker:
         self._undated_ns: int | None = None  # last tick at which frames could not be placed in time
         self._policy_valid = True
 
+    def retune(self, config: Config) -> None:
+        """Fly on under ``config``. Raises ConfigError where the pilot cannot; nothing has changed then."""
+        self._pilot.retune(config)
+        self._config = config
+
     def tracks(self) -> TrackTable:
         return self._pilot.tracks()
 

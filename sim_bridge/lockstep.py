@@ -17,7 +17,7 @@ from sim_bridge.placement import step_command
 from sim_bridge.scenario import OperatorStep
 
 COMPANION = 196  # MAV_COMP_ID_OBSTACLE_AVOIDANCE
-HEARTBEAT_ID = 0
+UNCOUNTED_IDS = {0, 22, 148, 247, 390}  # heartbeats, and what is timed by the wall clock: no part of a tick's answer
 SETPOINT_ID = 84
 
 
@@ -42,8 +42,8 @@ class Answer:
             self.progress += 1
 
     def packet(self, message_id: int, component: int, time_boot_ms: int | None) -> None:
-        """A MAVLink message of the onboard link; heartbeats do not count."""
-        if component != COMPANION or message_id == HEARTBEAT_ID:
+        """A MAVLink message of the onboard link; what is timed by the wall clock does not count."""
+        if component != COMPANION or message_id in UNCOUNTED_IDS:
             return
         if message_id == SETPOINT_ID:
             self._setpoint = self._setpoint or time_boot_ms == self.t_ns // 1_000_000

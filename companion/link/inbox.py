@@ -63,6 +63,10 @@ class ObstacleInbox:
         self._last_rejection = ""
         self._reported_ns: int | None = None
 
+    def retune(self, max_age_s: float) -> None:
+        """Another age at which frames are too old, from the next tick on."""
+        self._max_age_s = max_age_s
+
     def push(self, source: str, payload: bytes, encoding: str | None = None) -> None:
         """One frame as it arrived; never raises."""
         self._enqueue(source, payload, encoding)

@@ -15,7 +15,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.errors import CompanionError
-from companion.link import mav
+from companion.link import mav, params
 from companion.link.decode import DECODERS, Rejected, TextAssembler, command
 from companion.link.events import Command, Event
 from companion.link.framing import Framer
@@ -80,6 +80,8 @@ class MavlinkCodec:
                     events.extend(decode(message))
                 elif kind == mav.MSG_STATUSTEXT:
                     events.extend(self._texts.push(message))
+                elif kind in params.REQUESTS and params.is_for(message, self.system):
+                    events.append(params.decode(message))
                 elif kind in (mav.MSG_COMMAND_LONG, mav.MSG_COMMAND_INT) and self._is_for_us(message):
                     events.append(command(message))
             except Rejected as reason:
@@ -223,6 +225,10 @@ class MavlinkCodec:
                 link_rx_max=[_UINT32_UNKNOWN] * 6,
             )
         )
+
+    def encode(self, message: Any) -> bytes:
+        """A pymavlink message that another module has built."""
+        return self._pack(message)
 
     def _pack(self, message: Any) -> bytes:
         packet: bytes = message.pack(self._mav)

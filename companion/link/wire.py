@@ -106,7 +106,7 @@ class SetpointRecord(Struct, frozen=True, kw_only=True):
 
     stamp_ns: int
     sent: bool
-    messages: int  # MAVLink messages this tick put on the wire besides heartbeats; lockstep waits for them
+    messages: int  # MAVLink messages this tick put on the wire besides what wall time sends; lockstep waits for them
     state: str
     verdict: str
     u_ref: Vec | None  # net acceleration, ENU [m/s^2]

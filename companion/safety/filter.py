@@ -71,12 +71,16 @@ class SafetyFilter:
     """Admissible accelerations, tick by tick. Hidden state: last answer, epsilons, a detour under way."""
 
     def __init__(self, safety: SafetyConfig, limits: LimitsConfig) -> None:
+        self.retune(safety, limits)
+        self.reset()
+
+    def retune(self, safety: SafetyConfig, limits: LimitsConfig) -> None:
+        """Use other constants from the next step on; the last answer, every epsilon and a detour stay."""
         self._safety = safety
         self._limits = limits
         self._barrier = Barrier(safety)
         self._order = _OTHER[safety.solver]
         self._kept: tuple[float, Capability] | None = None
-        self.reset()
 
     def reset(self) -> None:
         """Forget the last answer and every epsilon: the next step equals the first of a new filter, bit for bit."""

@@ -56,6 +56,10 @@ class Tracker:
         self._now_ns = 0
         self._picture = empty_picture(self._constants)
 
+    def retune(self, vehicle_radius_m: float) -> None:
+        """From the next update on the vehicle is this large; all tracks stay."""
+        self._rules = replace(self._rules, vehicle_radius_m=vehicle_radius_m)
+
     def __len__(self) -> int:
         return int(self._visible().sum())
 

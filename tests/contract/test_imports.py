@@ -17,12 +17,15 @@ LAYERS = [
     {"companion", "companion.__version__", "companion.types", "companion.errors"},
     {"companion.frames", "companion.profiles", "companion.clock"},
     {"companion.config", "companion.config_check"},
+    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload"},
     {"companion.tracking", "companion.safety", "companion.policy", "companion.torch_backend", "companion.disturbance"},
     {"companion.pilot"},
     {"companion.state"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
     {
         "companion.latch",
+        "companion.microservices",
+        "companion.parameters",
         "companion.session",
         "companion.timebase",
         "companion.thinker",
@@ -39,6 +42,8 @@ BRAIN = (
     "companion/torch_backend.py",
     "companion/pilot.py",
     "companion/disturbance.py",
+    "companion/threats.py",
+    "companion/tunables.py",
 )
 NOT_IN_BRAIN = {"asyncio", "socket", "time", "random", "os", "logging", "threading", "datetime"}
 HEAVY = {"torch", "pybullet", "matplotlib", "filterpy", "mavsdk", "stable_baselines3", "gymnasium"}

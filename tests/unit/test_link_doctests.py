@@ -1,4 +1,4 @@
-"""The examples in the docstrings of the link modules are true."""
+"""The examples in the docstrings are true."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("name", ["link.mavlink", "link.timesync", "link.url", "link.ros2", "publish"])
+@pytest.mark.parametrize(
+    "name",
+    ["link.identity", "link.mavlink", "link.ros2", "link.timesync", "link.url", "publish", "hostload", "tunables"],
+)
 def test_docstring_examples(name: str) -> None:
     outcome = doctest.testmod(importlib.import_module(f"companion.{name}"))
     assert outcome.attempted > 0

@@ -383,3 +383,31 @@ def test_a_vehicle_by_zenoh_still_asks_whether_it_flies() -> None:
     asked = [int(m.param1) for m in rig.messages("COMMAND_LONG") if m.command == 511]
     assert asked == [245]
     assert rig.session.situation.airborne
+
+
+def test_a_command_of_another_module_is_answered_with_its_result(rig: Rig) -> None:
+    rig.beat(1.0)
+    rig.session.commands[31_005] = lambda command: 1 if command.params[0] > 0.0 else 2
+    assert rig.command(31_005, 1.0) == 1
+    assert rig.command(31_005, 0.0) == 2
+    assert rig.command(31_006, 0.0) == 3
+
+
+def test_the_same_text_is_not_said_twice_in_a_row(rig: Rig) -> None:
+    rig.beat(1.0)
+    rig.sent.clear()
+    for _ in range(30):
+        rig.session.say(4, "refused: something")
+        rig.beat(0.1)
+    assert [m.text for m in rig.messages("STATUSTEXT")] == ["refused: something"]
+    assert rig.session.text_counts["repeated"] == 29
+
+
+def test_time_outs_can_be_changed(rig: Rig) -> None:
+    rig.beat(1.0)
+    rig.session.retune(parse_config({"mavlink": {"system_id": 1}, "engage": {"stream_s": 2.0}}))
+    rig.command(92, 1.0)
+    rig.beat(1.8)
+    assert rig.mode_requests() == []
+    rig.beat(0.5)
+    assert rig.mode_requests() == [(6, 0)]
