@@ -19,6 +19,7 @@ from companion.link import mav
 from companion.link.decode import DECODERS, Rejected, TextAssembler, command
 from companion.link.events import Command, Event
 from companion.link.framing import Framer
+from companion.link.signing import FLAG_SIGNED, SIGNATURE_BLOCK, Signing
 from companion.profiles import ModeRequest
 from companion.types import Vec3
 
@@ -33,11 +34,11 @@ class SetpointRefused(CompanionError):
 
 
 class MavlinkCodec:
-    """One link's protocol state: the framer, the packet sequence and half-received texts.
+    """The daemon's protocol state: the framer, the packet sequence and half-received texts.
 
-    ``system`` is the vehicle's system id; the daemon is component 196 of it. ``counts`` tells what came in
-    (messages, unknown, bad_packets, garbage_bytes) and what was refused (not_finite, out_of_range, unknown_frame,
-    unix_stamp).
+    ``system`` is the vehicle's system id; the daemon is component 196 of it. ``signing`` signs what leaves and judges
+    what arrives. ``counts`` tells what came in (messages, unknown, bad_packets, garbage_bytes) and what was refused
+    (not_finite, out_of_range, unknown_frame, unix_stamp; with signing unsigned, bad_signature, future, replayed).
 
     >>> codec = MavlinkCodec(system=1)
     >>> codec.receive(b"noise")
@@ -46,9 +47,13 @@ class MavlinkCodec:
     5
     """
 
-    def __init__(self, *, system: int = 1) -> None:
-        self._framer = Framer()
+    def __init__(self, *, system: int = 1, signing: Signing | None = None) -> None:
+        self._signing = signing
+        self._framer = Framer(signing=signing)
         self._mav = dialect.MAVLink(None, system, mav.COMPONENT)
+        if signing is not None:
+            own = self._mav.signing
+            own.secret_key, own.link_id, own.sign_outgoing = signing.key, signing.link_id, True
         self._texts = TextAssembler()
         self._next_text_id = 1
 
@@ -71,8 +76,21 @@ class MavlinkCodec:
         component 0 are left to the autopilot. A message with a number that is not finite or absurd is dropped
         and counted.
         """
+        return self.events(self._framer.push(data))
+
+    def new_framer(self) -> Framer:
+        """A framer for one more link, under the same key and counts; what it finds goes to ``events``."""
+        return Framer(signing=self._signing, counts=self.counts, keep_unknown=True)
+
+    def close(self) -> None:
+        """Keep the signing timestamps for the next run."""
+        if self._signing is not None:
+            self._signing.close()
+
+    def events(self, messages: Iterable[Any]) -> list[Event]:
+        """Events in messages of a framer, as by ``receive``."""
         events: list[Event] = []
-        for message in self._framer.push(data):
+        for message in messages:
             kind = message.get_msgId()  # not .id: STATUSTEXT has a field of that name
             decode = DECODERS.get(kind)
             try:
@@ -225,6 +243,8 @@ class MavlinkCodec:
         )
 
     def _pack(self, message: Any) -> bytes:
+        if self._signing is not None:
+            self._mav.signing.timestamp = self._signing.next_timestamp()
         packet: bytes = message.pack(self._mav)
         self._mav.seq = (self._mav.seq + 1) % 256
         return packet
@@ -255,9 +275,14 @@ def _checked(name: str, values: Iterable[float], bound: float) -> list[float]:
 
 
 def packet_count(data: bytes) -> int:
-    """How many unsigned MAVLink 2 packets ``data``, made by this codec, consists of."""
+    """How many MAVLink 2 packets ``data``, made by this codec, consists of."""
     count = at = 0
     while at < len(data):
-        at += 12 + data[at + 1]
+        at += packet_length(data, at)
         count += 1
     return count
+
+
+def packet_length(data: bytes, at: int) -> int:
+    """Length of the whole MAVLink 2 packet that starts at ``at``."""
+    return 12 + data[at + 1] + (SIGNATURE_BLOCK if data[at + 2] & FLAG_SIGNED else 0)
