@@ -77,6 +77,11 @@ class VehicleSession:
             return False
         return state in FLYING or (state is State.READY and self._profile.streams_when_ready)
 
+    @property
+    def flies(self) -> bool:
+        """Whether our setpoints fly the vehicle now."""
+        return self.situation.state in FLYING
+
     def take_outgoing(self) -> list[bytes]:
         """Messages to send since the last call, in order."""
         outgoing, self._outgoing = self._outgoing, []
