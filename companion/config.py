@@ -41,7 +41,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class SigningConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     key_file: str | None = None  # of mode 0600; None: nothing is signed and nothing needs to be
     state_file: str | None = None  # timestamps kept over restarts; None: the clock alone
-    link_id: Annotated[int, Meta(ge=0, le=255)] = 0  # another for every daemon under the same ids
+    link_id: Annotated[int, Meta(ge=0, le=247)] = 0  # of mavlink.url; mavlink.links count up from it
     allow_unsigned: tuple[Literal["RADIO_STATUS", "ADSB_VEHICLE"], ...] = ("RADIO_STATUS", "ADSB_VEHICLE")
 
 

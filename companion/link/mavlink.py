@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -36,6 +36,7 @@ class SetpointRefused(CompanionError):
 class MavlinkCodec:
     """The daemon's protocol state: the framer, the packet sequence and half-received texts.
 
+    What the encoders return goes through ``seal`` on its way out.
     ``system`` is the vehicle's system id; the daemon is component 196 of it. ``signing`` signs what leaves and judges
     what arrives. ``counts`` tells what came in (messages, unknown, bad_packets, garbage_bytes) and what was refused
     (not_finite, out_of_range, unknown_frame, unix_stamp; with signing unsigned, bad_signature, future, replayed).
@@ -52,8 +53,8 @@ class MavlinkCodec:
         self._framer = Framer(signing=signing)
         self._mav = dialect.MAVLink(None, system, mav.COMPONENT)
         if signing is not None:
-            own = self._mav.signing
-            own.secret_key, own.link_id, own.sign_outgoing = signing.key, signing.link_id, True
+            # leaves room for the signature, which `seal` fills in
+            self._mav.signing.secret_key, self._mav.signing.sign_outgoing = b"", True
         self._texts = TextAssembler()
         self._next_text_id = 1
 
@@ -81,6 +82,12 @@ class MavlinkCodec:
     def new_framer(self) -> Framer:
         """A framer for one more link, under the same key and counts; what it finds goes to ``events``."""
         return Framer(signing=self._signing, counts=self.counts, keep_unknown=True)
+
+    def seal(self, data: bytes, link: int = 0) -> bytes:
+        """What the encoders made, signed for one link where signing is on; call it as the bytes leave."""
+        if self._signing is None:
+            return data
+        return b"".join(self._signing.seal(packet, link) for packet in packets(data))
 
     def close(self) -> None:
         """Keep the signing timestamps for the next run."""
@@ -243,8 +250,6 @@ class MavlinkCodec:
         )
 
     def _pack(self, message: Any) -> bytes:
-        if self._signing is not None:
-            self._mav.signing.timestamp = self._signing.next_timestamp()
         packet: bytes = message.pack(self._mav)
         self._mav.seq = (self._mav.seq + 1) % 256
         return packet
@@ -276,13 +281,13 @@ def _checked(name: str, values: Iterable[float], bound: float) -> list[float]:
 
 def packet_count(data: bytes) -> int:
     """How many MAVLink 2 packets ``data``, made by this codec, consists of."""
-    count = at = 0
+    return sum(1 for _ in packets(data))
+
+
+def packets(data: bytes) -> Iterator[bytes]:
+    """Each MAVLink 2 packet of ``data``, made by this codec."""
+    at = 0
     while at < len(data):
-        at += packet_length(data, at)
-        count += 1
-    return count
-
-
-def packet_length(data: bytes, at: int) -> int:
-    """Length of the whole MAVLink 2 packet that starts at ``at``."""
-    return 12 + data[at + 1] + (SIGNATURE_BLOCK if data[at + 2] & FLAG_SIGNED else 0)
+        end = at + 12 + data[at + 1] + (SIGNATURE_BLOCK if data[at + 2] & FLAG_SIGNED else 0)
+        yield data[at:end]
+        at = end

@@ -20,7 +20,7 @@ from companion.config import MavlinkConfig
 from companion.errors import ConfigError
 from companion.link import mav
 from companion.link.events import Event
-from companion.link.mavlink import MavlinkCodec, packet_length
+from companion.link.mavlink import MavlinkCodec, packets
 from companion.link.routes import LINK_LOCAL, SETPOINTS, Address, Routes, target_of
 from companion.link.transports import Transport, open_transport
 from companion.types import NS_PER_S
@@ -107,14 +107,11 @@ class Router:
     def send(self, data: bytes) -> None:
         """Packets of our codec, to where they belong; never blocks, never raises."""
         if len(self._links) == 1:
-            self._links[AUTOPILOT_LINK].send(data)
+            self._links[AUTOPILOT_LINK].send(self._codec.seal(data))
             return
-        at = 0 if self._links else len(data)
-        while at < len(data):
-            end = at + packet_length(data, at)
-            packet, at = data[at:end], end
+        for packet in packets(data) if self._links else ():
             for link in self._own_links(target_of(packet)):
-                self._links[link].send(packet)
+                self._links[link].send(self._codec.seal(packet, link))
 
     async def close(self) -> None:
         for link in self._links:

@@ -66,7 +66,7 @@ class Signing:
     Args:
         key: 32 bytes.
         unix_ns: the clock, Unix time [ns].
-        link_id: goes into every packet of ours.
+        link_id: of our first link; the others count up from it.
         allow_unsigned: message ids that are taken without a signature; they are not to be trusted.
         state: from an earlier run. Its transmit timestamp counts if it is at most a day ahead of the clock.
         persist: called with the state to keep, before a timestamp beyond the last kept one is used: every 10 s.
@@ -86,8 +86,8 @@ class Signing:
     ) -> None:
         if len(key) != KEY_BYTES:
             raise ValueError(f"key: expected {KEY_BYTES} bytes, got {len(key)}")
-        self.key = key
-        self.link_id = link_id
+        self._key = key
+        self._link_id = link_id
         self._unix_ns = unix_ns
         self._allow_unsigned = frozenset(allow_unsigned)
         self._persist = persist
@@ -95,6 +95,15 @@ class Signing:
         self._transmit = self._kept = self._floor = 0
         if state is not None:
             self._resume(state, on_report)
+
+    def seal(self, packet: bytes, link: int = 0) -> bytes:
+        """The packet with its signature block filled in, to be sent on ``link`` before any other packet is sealed.
+
+        What is sealed early and sent late would be a replay to its receiver.
+        """
+        link_id = (self._link_id + link) & 0xFF
+        body = packet[:-SIGNATURE_BLOCK] + bytes([link_id]) + self.next_timestamp().to_bytes(6, "little")
+        return body + signature(self._key, body)
 
     def next_timestamp(self) -> int:
         """The timestamp of the next packet: the clock's, but greater than every earlier one."""
@@ -117,7 +126,7 @@ class Signing:
         if not is_signed(packet):
             return None if message_id in self._allow_unsigned else "unsigned"
         view = memoryview(packet)
-        if not hmac.compare_digest(signature(self.key, view[:-6]), bytes(view[-6:])):
+        if not hmac.compare_digest(signature(self._key, view[:-6]), bytes(view[-6:])):
             return "bad_signature"
         link_id = packet[-SIGNATURE_BLOCK]
         timestamp = int.from_bytes(view[-12:-6], "little")

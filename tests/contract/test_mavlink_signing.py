@@ -70,7 +70,7 @@ def resigned(packet: bytes, *, timestamp: int | None = None, key: bytes = KEY) -
 def test_a_signed_heartbeat_byte_by_byte() -> None:
     """The specification by hand: flag 0x01, then link id, 48 bits of 10 us since 2015, SHA-256's first six bytes."""
     codec = MavlinkCodec(system=1, signing=Signing(KEY, Time(), link_id=9))
-    packet = codec.encode_heartbeat(mav.STATE_ACTIVE)
+    packet = codec.seal(codec.encode_heartbeat(mav.STATE_ACTIVE))
     header_and_payload = bytes.fromhex("fd 09 01 00 00 01 c4 00 00 00") + bytes.fromhex("00 00 00 00 12 08 01 04 03")
     crc = dialect.x25crc(header_and_payload[1:] + bytes([50])).crc.to_bytes(2, "little")  # CRC_EXTRA of HEARTBEAT
     block = b"\x09" + NOW.to_bytes(6, "little")
@@ -91,15 +91,33 @@ def test_pymavlink_takes_what_we_sign() -> None:
     data = b"".join(
         [codec.encode_heartbeat(4), codec.encode_statustext(6, "long " * 30), codec.encode_timesync_request(3)]
     )
-    messages = other.parse_buffer(data)
+    messages = other.parse_buffer(codec.seal(data))
     assert [m.get_type() for m in messages] == ["HEARTBEAT", *["STATUSTEXT"] * 4, "TIMESYNC"]
     assert all(m.get_signed() for m in messages)
     assert (other.signing.goodsig_count, other.signing.badsig_count) == (6, 0)
 
 
 def test_pymavlink_refuses_what_we_sign_with_another_key() -> None:
-    other = peer(NOW - 30 * S, key=bytes(32))
-    assert [m.get_type() for m in other.parse_buffer(ours().encode_heartbeat(4))] == ["BAD_DATA"]
+    codec, other = ours(), peer(NOW - 30 * S, key=bytes(32))
+    assert [m.get_type() for m in other.parse_buffer(codec.seal(codec.encode_heartbeat(4)))] == ["BAD_DATA"]
+
+
+def test_what_is_encoded_early_and_sent_late_is_taken() -> None:
+    """The timestamp is that of leaving: a queue that is overtaken would be full of replays otherwise."""
+    codec, other = ours(), peer(NOW - 30 * S)
+    early, late = codec.encode_statustext(6, "queued"), codec.encode_heartbeat(4)
+    assert [m.get_type() for m in other.parse_buffer(codec.seal(late) + codec.seal(early))] == [
+        "HEARTBEAT",
+        "STATUSTEXT",
+    ]
+
+
+def test_every_link_of_ours_is_a_stream_of_its_own() -> None:
+    """One receiver on two links of different delay refuses neither."""
+    codec, other = ours(), peer(NOW - 30 * S)
+    slow, fast = codec.seal(codec.encode_heartbeat(4), 0), codec.seal(codec.encode_heartbeat(4), 1)
+    assert (slow[-13], fast[-13]) == (0, 1)
+    assert all(m.get_signed() for m in other.parse_buffer(fast + slow))
 
 
 def test_we_take_what_pymavlink_signs() -> None:
@@ -236,7 +254,7 @@ def test_random_bytes_never_raise(chunks: list[bytes], wrapped: bool) -> None:
 
 
 def stamps(codec: MavlinkCodec, count: int) -> list[int]:
-    return [int.from_bytes(codec.encode_heartbeat(4)[-12:-6], "little") for _ in range(count)]
+    return [int.from_bytes(codec.seal(codec.encode_heartbeat(4))[-12:-6], "little") for _ in range(count)]
 
 
 def test_timestamps_never_repeat_though_the_clock_stands_or_goes_back() -> None:
@@ -437,7 +455,7 @@ def test_signing_as_configured(key_file: Any, tmp_path: Path) -> None:
     signing = open_signing(config, Time(), pytest.fail)
     assert signing is not None
     codec = MavlinkCodec(signing=signing)
-    packet = codec.encode_heartbeat(4)
+    packet = codec.seal(codec.encode_heartbeat(4))
     assert packet[-13] == 3
     assert packet[-6:] == signature(KEY, packet[:-6])
     codec.close()
@@ -451,7 +469,8 @@ def test_signing_as_configured(key_file: Any, tmp_path: Path) -> None:
 
 def test_without_a_key_nothing_is_signed() -> None:
     assert open_signing(SigningConfig(), Time(), pytest.fail) is None
-    assert MavlinkCodec().encode_heartbeat(4)[2] == 0
+    codec = MavlinkCodec()
+    assert codec.seal(codec.encode_heartbeat(4))[2] == 0
     with pytest.raises(ConfigError, match=r"mavlink\.signing\.state_file: expected only together with"):
         open_signing(SigningConfig(state_file="x"), Time(), pytest.fail)
 

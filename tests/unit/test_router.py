@@ -387,6 +387,7 @@ def test_every_link_gets_signed_packets() -> None:
         for peer in scene.peers:
             (packet,) = peer.datagrams()
             assert packet[-6:] == hashlib.sha256(KEY + packet[:-6]).digest()[:6]
+            assert packet[-13] == scene.peers.index(peer)  # each link is a stream of its own
 
     run(script, key=KEY)
 
