@@ -95,7 +95,7 @@ class Framer:
         if self._signing is None:
             return at + length == len(data) or data[at + length] in _MAGICS
         packet = data[at : at + length]
-        return is_signed(packet) and self._signing.refusal(packet, packet[5], packet[6], -1) is None
+        return self._signing.refusal(packet, packet[5], packet[6], -1) is None
 
     def _decode(self, data: bytes, at: int) -> tuple[Any | None, int]:
         """The message at ``at``, None if it fails, and its length, 0 while more bytes are needed."""

@@ -151,8 +151,8 @@ class Router:
         target = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         if header.msgId in SETPOINTS and self._is_blocked(link, sender, target):
             return False
-        if target != own and header.msgId not in LINK_LOCAL:
-            self._pass_on(link, message, target)
+        if header.msgId not in LINK_LOCAL:
+            self._pass_on(link, message, target)  # what is meant for us alone goes nowhere: we are heard on no link
         return link == AUTOPILOT_LINK or not _is_autopilot(message)  # others' autopilots are not ours to choose from
 
     def _pass_on(self, link: int, message: Any, target: Address) -> None:

@@ -159,10 +159,8 @@ class Signing:
         ahead = state.transmit - now
         if ahead <= MAX_PERSISTED_AHEAD:
             self._transmit = self._floor = state.transmit
-        latest = max(now, self._floor) + MAX_AHEAD
         for system, component, link_id, last in state.streams[:_MAX_STREAMS]:
-            if last <= latest:
-                self._streams[system, component, link_id] = last
+            self._streams[system, component, link_id] = last
         if ahead > MAX_AHEAD and on_report is not None:
             used = "is used" if self._floor else "is not used, more than a day"
             on_report(

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from companion.clock import SystemClock
 from companion.config import parse_config
 from companion.errors import ConfigError
+from companion.link.signing import timestamp_at
 from companion.metrics import Summary
 from companion.service import Service
 from sim_bridge.testing import free_port
@@ -183,6 +184,7 @@ def test_a_signed_flight_with_pymavlink_on_both_sides(tmp_path: Path) -> None:
     assert summary.counts["mavlink.unsigned"] == 1
     assert summary.counts.get("mavlink.bad_signature", 0) == 0
     first = json.loads(state.read_text())
+    assert first["transmit"] <= timestamp_at(SystemClock().unix_ns())  # closed: no reserve is skipped
     assert {tuple(stream[:2]) for stream in first["streams"]} == {(1, 1), (255, 190)}
 
     run(script, daemon={"signing": signing}, keys=(KEY, KEY))  # a second flight goes on from there
