@@ -87,7 +87,8 @@ class Framer:
             self.counts[why] += 1
             return False
         message._signed = is_signed(packet)
-        self.counts["allowed_unsigned"] += not message._signed
+        if not message._signed:
+            self.counts["allowed_unsigned"] += 1
         return True
 
     def _fits(self, data: bytes, at: int, length: int) -> bool:

@@ -300,6 +300,23 @@ def test_tcp_drops_what_a_stalled_peer_does_not_take() -> None:
     run(scenario)
 
 
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="Linux only")
+def test_tcp_gives_up_on_a_peer_that_acknowledges_nothing() -> None:
+    """A peer without power says no goodbye; loopback cannot show that, so the option is looked at on both ends."""
+
+    async def scenario() -> None:
+        async with opened(f"tcpin://{LOOPBACK}:0", Inbox()) as server:
+            url = f"tcpout://{LOOPBACK}:{server.local_address[1]}"
+            async with opened(url, Inbox(), ManualClock()) as client, asyncio.timeout(5.0):
+                while client._peer is None or server._peer is None or server._peer._transport is None:
+                    await asyncio.sleep(0)
+                for end in (client, server):
+                    stream = end._peer._transport.get_extra_info("socket")
+                    assert stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 5000
+
+    run(scenario)
+
+
 def test_serial_pty_both_ways_raw() -> None:
     async def scenario() -> None:
         master, slave = os.openpty()
