@@ -44,10 +44,21 @@ class VehicleConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     stale_s: Positive = 0.5  # a vehicle state older than this is no longer fresh
 
 
+class SigningConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    key_file: str | None = None  # of mode 0600; None: nothing is signed and nothing needs to be
+    state_file: str | None = None  # timestamps kept over restarts; None: the clock alone
+    link_id: Annotated[int, Meta(ge=0, le=247)] = 0  # of mavlink.url; mavlink.links count up from it
+    allow_unsigned: tuple[Literal["RADIO_STATUS", "ADSB_VEHICLE"], ...] = ("RADIO_STATUS", "ADSB_VEHICLE")
+
+
 class MavlinkConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     url: str = "udpin://0.0.0.0:14540"
     system_id: Annotated[int, Meta(ge=1, le=255)] | None = None  # None: latch the one autopilot heard for 3 s
     heartbeat_timeout_s: Positive = 5.0
+    links: Annotated[tuple[str, ...], Meta(max_length=8)] = ()  # further links: ground station, sensors
+    forward: bool = False  # pass messages on between the links
+    block_other_setpoints: bool = False  # do not pass on setpoints of others to the autopilot while we fly it
+    signing: SigningConfig = SigningConfig()
 
 
 class ZenohConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

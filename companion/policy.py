@@ -135,7 +135,7 @@ class Policy:
             ArtifactError: it asks for more than they allow.
         """
         check_limits(self.manifest, limits, self.manifest.name)
-        return Policy(self.manifest, self.digest, self._network, self._config, limits)
+        return Policy(self.manifest, self.digest, self.network, self._config, limits)
 
     def action(self, v_enu: Vec3, error_enu: Vec3) -> Vec3:
         """The network alone: pi([v, e]) in [-1, 1]^3, float64."""

@@ -17,11 +17,12 @@ from companion.config import Config
 from companion.doors import Doors
 from companion.errors import CompanionError, LockstepStalled
 from companion.link import mav
-from companion.link.events import TimesyncReply, TimesyncRequest
+from companion.link.events import Event, TimesyncReply, TimesyncRequest
 from companion.link.inbox import ObstacleInbox
 from companion.link.mavlink import MavlinkCodec, packet_count
 from companion.link.params import ParamRequest
-from companion.link.transports import Transport, open_transport
+from companion.link.router import Router
+from companion.link.signing_files import open_signing
 from companion.link.zenoh import ZenohLink
 from companion.metrics import Summary, TickMeter
 from companion.microservices import Microservices
@@ -54,9 +55,11 @@ class Service:
         self._config = config
         self._clock = clock
         self._lockstep = config.sync == "lockstep"
-        self._codec = MavlinkCodec(system=config.mavlink.system_id or 1)
+        signing = open_signing(config.mavlink.signing, clock.unix_ns, log.warning)
+        self._codec = MavlinkCodec(system=config.mavlink.system_id or 1, signing=signing)
         self._route = Route(config.target, config.limits)
         self._session = VehicleSession(config, self._codec, self._route.set_position)
+        self._transport = Router(config.mavlink, self._codec, self._session, clock, self._on_events)
         self._inbox = ObstacleInbox(
             queue=config.obstacles.queue,
             max_age_s=config.obstacles.max_age_s,
@@ -64,7 +67,7 @@ class Service:
             on_report=log.warning,
         )
         self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
-        self._time = TimeBase(clock, self._codec, self._send, self._on_reboot)
+        self._time = TimeBase(clock, self._codec, self._transport.send, self._on_reboot)
         self._meter = TickMeter(1.0 / config.rate_hz)
         self._publisher: Publisher
         self._doors = Doors(
@@ -78,7 +81,7 @@ class Service:
             on_change=self._on_change,
         )
         self._services = Microservices(
-            base, config, self._codec, self._session, clock, send=self._send, retune=self._retune
+            base, config, self._codec, self._session, clock, send=self._transport.send, retune=self._retune
         )
         self._wake = asyncio.Event()
         self._stopping = False
@@ -86,10 +89,8 @@ class Service:
         self._arrived_ns = 0  # its arrival, for the latency figure
         self._pending_since_ns = 0
         self._vehicle_ns = 0  # vehicle time of the newest state
-        self._heard_wall_ns: int | None = None  # any bytes from the vehicle's link
         self._log_failed = False
         self._last_beat: tuple[int, int] | None = None
-        self._transport: Transport
 
     def stop(self) -> None:
         """Ask for a clean end: release first if flying, then close everything."""
@@ -110,7 +111,7 @@ class Service:
             if config.log.directory is not None:
                 recorder = Recorder(Path(config.log.directory) / "flight.mcap", config)
                 stack.callback(recorder.close)
-            self._transport = await open_transport(config.mavlink.url, self._on_bytes, clock=self._clock)
+            await self._transport.open()
             stack.push_async_callback(self._transport.close)
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
@@ -188,7 +189,7 @@ class Service:
 
     def _check_simulator(self) -> None:
         """In lockstep: a simulator that holds time still sends heartbeats; one that is gone sends nothing."""
-        heard_ns = self._heard_wall_ns
+        heard_ns = self._transport.heard_ns
         if heard_ns is not None and self._clock.monotonic_ns() - heard_ns > GONE_NS:
             raise LockstepStalled(
                 f"lockstep: nothing from the vehicle for {GONE_NS / 1e9:g} s after {self._vehicle_ns} ns"
@@ -244,7 +245,7 @@ class Service:
         last = self._last_beat
         if last is None or now_ns - last[0] >= HEARTBEAT_NS or wall_ns - last[1] >= HEARTBEAT_NS:
             self._last_beat = (now_ns, wall_ns)
-            self._send(self._services.heartbeat())
+            self._transport.send(self._services.heartbeat())
         self._services.poll()
         self._flush()
         self._publish_status(now_ns)
@@ -257,9 +258,6 @@ class Service:
             self._log_failed = True
             log.error("%s", failure)
             self._session.say(mav.SEVERITY_WARNING, "companion: log lost, flying on")
-
-    def _send(self, data: bytes) -> None:
-        self._transport.send(data)
 
     def _flush(self) -> int:
         """Send what the session has to say; the number of MAVLink packets."""
@@ -281,7 +279,8 @@ class Service:
     def _counts(self) -> dict[str, int]:
         """Everything counted, by kind."""
         groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
-        return self._meter.counts({**groups, "mavlink": self._codec.counts, "texts": self._session.text_counts})
+        groups |= {"mavlink": self._codec.counts, "texts": self._session.text_counts}
+        return self._meter.counts(groups) | self._transport.all_counts()
 
     def _summary(self, recorder: Recorder | None) -> Summary:
         log_path = None if recorder is None else str(recorder.path)
@@ -290,9 +289,8 @@ class Service:
 
     # what the links hand in
 
-    def _on_bytes(self, data: bytes) -> None:
-        self._heard_wall_ns = self._clock.monotonic_ns()
-        for event in self._codec.receive(data):
+    def _on_events(self, events: list[Event]) -> None:
+        for event in events:
             if isinstance(event, TimesyncRequest | TimesyncReply):
                 self._time.handle(event, self._session.system)
             elif isinstance(event, ParamRequest):

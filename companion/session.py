@@ -90,6 +90,11 @@ class VehicleSession:
         """Time-outs of ``config`` from now on."""
         self._config = config
 
+    @property
+    def flies(self) -> bool:
+        """Whether our setpoints fly the vehicle now."""
+        return self.situation.state in FLYING
+
     def take_outgoing(self) -> list[bytes]:
         """Messages to send since the last call, in order."""
         outgoing, self._outgoing = self._outgoing, []

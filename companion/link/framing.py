@@ -11,18 +11,30 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from companion.link.signing import Signing, is_signed
+
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _MAGICS = (_V1, _V2)
 
 
 class Framer:
-    """Splits one byte stream. ``counts``: messages, unknown, bad_packets, garbage_bytes."""
+    """Splits one byte stream. ``counts``: messages, unknown, bad_packets, garbage_bytes.
 
-    def __init__(self) -> None:
+    With ``signing`` each packet is judged too; what is refused is counted by why (unsigned, bad_signature, future,
+    replayed) and dropped whole. ``message.get_signed()`` then tells a proven message from one on the unsigned
+    allowlist (counted as allowed_unsigned). ``keep_unknown`` hands on messages outside the dialect
+    (`MAVLink_unknown`) where they lie exactly between packets, for routers; with signing only what is proven.
+    """
+
+    def __init__(
+        self, *, signing: Signing | None = None, counts: Counter[str] | None = None, keep_unknown: bool = False
+    ) -> None:
         self._pending = b""
         self._decoder = dialect.MAVLink(None)
-        self.counts: Counter[str] = Counter()
+        self._signing = signing
+        self._keep_unknown = keep_unknown
+        self.counts: Counter[str] = Counter() if counts is None else counts
 
     def push(self, data: bytes) -> list[Any]:
         """pymavlink messages that ``data`` completes. Never raises, whatever the bytes."""
@@ -36,7 +48,7 @@ class Framer:
 
     def _scan(self, data: bytes, *, final: bool) -> list[Any]:
         messages: list[Any] = []
-        at = 0
+        at = clean = 0  # up to ``clean`` everything was packets
         excused = 0  # up to here lies an unknown message: searched, since its checksum cannot be known, not counted
         while at < len(data):
             if data[at] not in _MAGICS:
@@ -52,13 +64,39 @@ class Framer:
                 at += 1
             elif isinstance(message, dialect.MAVLink_unknown):
                 self.counts["unknown"] += at >= excused
+                if at == clean and self._keep_unknown and self._fits(data, at, length):
+                    messages.append(message)
+                    clean = at + length
                 excused = max(excused, at + length)
                 at += 1
             else:
-                self.counts["messages"] += 1
-                messages.append(message)
+                if self._accepts(message):
+                    self.counts["messages"] += 1
+                    messages.append(message)
                 at += length
+                clean = at
         return messages
+
+    def _accepts(self, message: Any) -> bool:
+        if self._signing is None:
+            return True
+        header = message._header
+        packet = message.get_msgbuf()
+        why = self._signing.refusal(packet, header.srcSystem, header.srcComponent, header.msgId)
+        if why is not None:
+            self.counts[why] += 1
+            return False
+        message._signed = is_signed(packet)
+        if not message._signed:
+            self.counts["allowed_unsigned"] += 1
+        return True
+
+    def _fits(self, data: bytes, at: int, length: int) -> bool:
+        """Whether an unknown message, whose checksum cannot be known, is one: proven, or followed by a packet."""
+        if self._signing is None:
+            return at + length == len(data) or data[at + length] in _MAGICS
+        packet = data[at : at + length]
+        return self._signing.refusal(packet, packet[5], packet[6], -1) is None
 
     def _decode(self, data: bytes, at: int) -> tuple[Any | None, int]:
         """The message at ``at``, None if it fails, and its length, 0 while more bytes are needed."""

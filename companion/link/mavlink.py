@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -19,6 +19,7 @@ from companion.link import mav, params
 from companion.link.decode import DECODERS, Rejected, TextAssembler, command
 from companion.link.events import Command, Event
 from companion.link.framing import Framer
+from companion.link.signing import FLAG_SIGNED, SIGNATURE_BLOCK, Signing
 from companion.profiles import ModeRequest
 from companion.types import Vec3
 
@@ -33,11 +34,12 @@ class SetpointRefused(CompanionError):
 
 
 class MavlinkCodec:
-    """One link's protocol state: the framer, the packet sequence and half-received texts.
+    """The daemon's protocol state: the framer, the packet sequence and half-received texts.
 
-    ``system`` is the vehicle's system id; the daemon is component 196 of it. ``counts`` tells what came in
-    (messages, unknown, bad_packets, garbage_bytes) and what was refused (not_finite, out_of_range, unknown_frame,
-    unix_stamp).
+    What the encoders return goes through ``seal`` on its way out.
+    ``system`` is the vehicle's system id; the daemon is component 196 of it. ``signing`` signs what leaves and judges
+    what arrives. ``counts`` tells what came in (messages, unknown, bad_packets, garbage_bytes) and what was refused
+    (not_finite, out_of_range, unknown_frame, unix_stamp; with signing unsigned, bad_signature, future, replayed).
 
     >>> codec = MavlinkCodec(system=1)
     >>> codec.receive(b"noise")
@@ -46,9 +48,13 @@ class MavlinkCodec:
     5
     """
 
-    def __init__(self, *, system: int = 1) -> None:
-        self._framer = Framer()
+    def __init__(self, *, system: int = 1, signing: Signing | None = None) -> None:
+        self._signing = signing
+        self._framer = Framer(signing=signing)
         self._mav = dialect.MAVLink(None, system, mav.COMPONENT)
+        if signing is not None:
+            # leaves room for the signature, which `seal` fills in
+            self._mav.signing.secret_key, self._mav.signing.sign_outgoing = b"", True
         self._texts = TextAssembler()
         self._next_text_id = 1
 
@@ -71,8 +77,27 @@ class MavlinkCodec:
         component 0 are left to the autopilot. A message with a number that is not finite or absurd is dropped
         and counted.
         """
+        return self.events(self._framer.push(data))
+
+    def new_framer(self) -> Framer:
+        """A framer for one more link, under the same key and counts; what it finds goes to ``events``."""
+        return Framer(signing=self._signing, counts=self.counts, keep_unknown=True)
+
+    def seal(self, data: bytes, link: int = 0) -> bytes:
+        """What the encoders made, signed for one link where signing is on; call it as the bytes leave."""
+        if self._signing is None:
+            return data
+        return b"".join(self._signing.seal(packet, link) for packet in packets(data))
+
+    def close(self) -> None:
+        """Keep the signing timestamps for the next run."""
+        if self._signing is not None:
+            self._signing.close()
+
+    def events(self, messages: Iterable[Any]) -> list[Event]:
+        """Events in messages of a framer, as by ``receive``."""
         events: list[Event] = []
-        for message in self._framer.push(data):
+        for message in messages:
             kind = message.get_msgId()  # not .id: STATUSTEXT has a field of that name
             decode = DECODERS.get(kind)
             try:
@@ -261,9 +286,14 @@ def _checked(name: str, values: Iterable[float], bound: float) -> list[float]:
 
 
 def packet_count(data: bytes) -> int:
-    """How many unsigned MAVLink 2 packets ``data``, made by this codec, consists of."""
-    count = at = 0
+    """How many MAVLink 2 packets ``data``, made by this codec, consists of."""
+    return sum(1 for _ in packets(data))
+
+
+def packets(data: bytes) -> Iterator[bytes]:
+    """Each MAVLink 2 packet of ``data``, made by this codec."""
+    at = 0
     while at < len(data):
-        at += 12 + data[at + 1]
-        count += 1
-    return count
+        end = at + 12 + data[at + 1] + (SIGNATURE_BLOCK if data[at + 2] & FLAG_SIGNED else 0)
+        yield data[at:end]
+        at = end

@@ -10,6 +10,8 @@ from functools import partial
 from companion.clock import Clock
 from companion.link.url import FIRST_RETRY_S, LAST_RETRY_S, MAX_BACKLOG_BYTES, OnBytes, TransportUrl
 
+DEAD_MS = 5000  # what we sent is not acknowledged: the connection is lost
+
 
 class _StreamPeer(asyncio.Protocol):
     """One TCP connection of a `TcpServer` or `TcpClient`."""
@@ -26,6 +28,8 @@ class _StreamPeer(asyncio.Protocol):
         stream = transport.get_extra_info("socket")
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         stream.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_BACKLOG_BYTES)  # the default holds minutes
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # a peer without power says no goodbye: the kernel waits 15 min for it
+            stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, DEAD_MS)
         transport.set_write_buffer_limits(high=0)
 
     def data_received(self, data: bytes) -> None:

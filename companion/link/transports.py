@@ -22,13 +22,17 @@ from companion.link.url import OnBytes, Transport, parse_url
 __all__ = ["OnBytes", "Transport", "open_transport", "parse_url"]
 
 
-async def open_transport(url: str, on_bytes: OnBytes, *, clock: Clock | None = None) -> Transport:
+async def open_transport(
+    url: str, on_bytes: OnBytes, *, clock: Clock | None = None, key: str = "mavlink.url"
+) -> Transport:
     """Open the link and call ``on_bytes`` with whatever arrives, in the loop's thread.
+
+    ``key`` is where the configuration has the URL, for errors.
 
     Raises:
         ConfigError: a bad URL, a port in use, an unknown host, a device that cannot be opened; names the URL.
     """
-    parsed = parse_url(url)
+    parsed = parse_url(url, key)
     clock = clock or SystemClock()
     try:
         match parsed.scheme:
@@ -44,4 +48,4 @@ async def open_transport(url: str, on_bytes: OnBytes, *, clock: Clock | None = N
                 return SerialPort(parsed, on_bytes, clock)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ConfigError(f"mavlink.url {url}: cannot be opened ({reason}), expected a free port or device") from None
+        raise ConfigError(f"{key} {url}: cannot be opened ({reason}), expected a free port or device") from None

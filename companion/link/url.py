@@ -40,8 +40,8 @@ class TransportUrl:
     port: int
 
 
-def parse_url(url: str) -> TransportUrl:
-    """The parts of a transport URL.
+def parse_url(url: str, key: str = "mavlink.url") -> TransportUrl:
+    """The parts of a transport URL; ``key`` is where the configuration has it.
 
     >>> parse_url("udpin://0.0.0.0:14540")
     TransportUrl(scheme='udpin', host='0.0.0.0', port=14540)
@@ -53,10 +53,10 @@ def parse_url(url: str) -> TransportUrl:
         scheme, host, port = match[1], match[2].strip("[]"), int(match[3])
         lowest = 0 if scheme.endswith("in") else 1
         if not lowest <= port <= 65535:
-            raise ConfigError(f"mavlink.url {url}: expected a port within {lowest}..65535")
+            raise ConfigError(f"{key} {url}: expected a port within {lowest}..65535")
         return TransportUrl(scheme, host, port)
     if match := _SERIAL.fullmatch(url):
         if not hasattr(termios, f"B{match[2]}"):
-            raise ConfigError(f"mavlink.url {url}: expected a standard baud rate such as 57600 or 921600")
+            raise ConfigError(f"{key} {url}: expected a standard baud rate such as 57600 or 921600")
         return TransportUrl("serial", match[1], int(match[2]))
-    raise ConfigError(f"mavlink.url {url}: {_EXPECTED}")
+    raise ConfigError(f"{key} {url}: {_EXPECTED}")

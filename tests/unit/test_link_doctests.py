@@ -10,7 +10,18 @@ import pytest
 
 @pytest.mark.parametrize(
     "name",
-    ["link.identity", "link.mavlink", "link.ros2", "link.timesync", "link.url", "publish", "hostload", "tunables"],
+    [
+        "hostload",
+        "link.identity",
+        "link.mavlink",
+        "link.ros2",
+        "link.routes",
+        "link.signing",
+        "link.timesync",
+        "link.url",
+        "publish",
+        "tunables",
+    ],
 )
 def test_docstring_examples(name: str) -> None:
     outcome = doctest.testmod(importlib.import_module(f"companion.{name}"))

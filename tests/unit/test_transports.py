@@ -35,6 +35,18 @@ class Inbox:
                 await self._changed.wait()
 
 
+class Waits(ManualClock):
+    """Remembers how long was asked to sleep."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: list[float] = []
+
+    async def sleep(self, seconds: float) -> None:
+        self.waits.append(seconds)
+        await super().sleep(seconds)
+
+
 @asynccontextmanager
 async def opened(url: str, inbox: Inbox, clock: ManualClock | None = None) -> AsyncIterator[Transport]:
     transport = await open_transport(url, inbox, clock=clock)
@@ -100,6 +112,46 @@ def test_udpin_random_senders_cannot_push_the_autopilot_out() -> None:
     run(scenario)
 
 
+def test_udpin_follows_a_peer_that_comes_back_on_another_port() -> None:
+    async def scenario() -> None:
+        inbox, clock = Inbox(), ManualClock()
+        async with opened(f"udpin://{LOOPBACK}:0", inbox, clock) as link:
+            with udp_socket() as before:
+                before.sendto(b"one", link.local_address)
+                await inbox.until(b"one")
+            clock.advance(5.1)
+            link.send(b"nobody")  # it is gone, and forgotten
+            assert link.peers == ()
+            with udp_socket() as after:
+                after.sendto(b"two", link.local_address)
+                await inbox.until(b"two")
+                link.send(b"welcome")
+                assert after.recv(100) == b"welcome"
+
+    run(scenario)
+
+
+def test_udpout_goes_on_when_its_peer_was_away() -> None:
+    async def scenario() -> None:
+        inbox = Inbox()
+        with udp_socket() as peer:
+            port = peer.getsockname()[1]
+        async with opened(f"udpout://{LOOPBACK}:{port}", inbox) as link:
+            for _ in range(3):
+                link.send(b"lost")  # refused by the system's ICMP: nothing to stop for
+                await asyncio.sleep(0)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as back:
+                back.bind((LOOPBACK, port))
+                back.settimeout(5.0)
+                link.send(b"found")
+                data, address = back.recvfrom(100)
+                assert data == b"found"
+                back.sendto(b"answer", address)
+                await inbox.until(b"answer")
+
+    run(scenario)
+
+
 def test_udpout_sends_and_hears_the_answer() -> None:
     async def scenario() -> None:
         inbox = Inbox()
@@ -137,6 +189,60 @@ def test_tcp_pair_both_ways_and_reconnect() -> None:
                         clock.advance(0.2)
                         await asyncio.sleep(0)
                 writer.close()
+
+    run(scenario)
+
+
+def test_tcpin_takes_its_client_back() -> None:
+    async def scenario() -> None:
+        inbox = Inbox()
+        async with opened(f"tcpin://{LOOPBACK}:0", inbox) as server, asyncio.timeout(5.0):
+            for word in (b"once", b"again"):
+                server.send(b"nobody")
+                reader, writer = await asyncio.open_connection(*server.local_address)
+                writer.write(word)
+                await inbox.until(word)
+                server.send(b"<" + word + b">")
+                assert await reader.readexactly(len(word) + 2) == b"<" + word + b">"
+                writer.close()
+                await writer.wait_closed()
+
+    run(scenario)
+
+
+async def waits_of(clock: Waits, count: int, failed: Callable[[], int]) -> list[float]:
+    """The first ``count`` waits between attempts, each let pass in full and not before."""
+    async with asyncio.timeout(5.0):
+        for number in range(count):
+            while len(clock.waits) <= number:
+                await asyncio.sleep(0)
+            before = failed()
+            clock.advance(0.99 * clock.waits[number])
+            for _ in range(5):
+                await asyncio.sleep(0)
+            assert failed() == before
+            clock.advance(0.02 * clock.waits[number])
+    return clock.waits[:count]
+
+
+def test_tcpout_retries_later_and_later() -> None:
+    async def scenario() -> None:
+        with socket.socket() as placeholder:
+            placeholder.bind((LOOPBACK, 0))
+            port = placeholder.getsockname()[1]
+        clock = Waits()
+        async with opened(f"tcpout://{LOOPBACK}:{port}", Inbox(), clock) as client:
+            waits = await waits_of(clock, 7, lambda: client.counts["failed_connects"])
+            assert waits == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
+            async with opened(f"tcpin://{LOOPBACK}:{port}", Inbox()), asyncio.timeout(5.0):
+                while client.counts["connects"] == 0:
+                    clock.advance(5.0)
+                    await asyncio.sleep(0)
+            async with asyncio.timeout(5.0):  # lost after it was there: from the beginning
+                seen = len(clock.waits)
+                while len(clock.waits) == seen:
+                    await asyncio.sleep(0)
+            assert clock.waits[-1] == 0.2
 
     run(scenario)
 
@@ -194,6 +300,23 @@ def test_tcp_drops_what_a_stalled_peer_does_not_take() -> None:
     run(scenario)
 
 
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="Linux only")
+def test_tcp_gives_up_on_a_peer_that_acknowledges_nothing() -> None:
+    """A peer without power says no goodbye; loopback cannot show that, so the option is looked at on both ends."""
+
+    async def scenario() -> None:
+        async with opened(f"tcpin://{LOOPBACK}:0", Inbox()) as server:
+            url = f"tcpout://{LOOPBACK}:{server.local_address[1]}"
+            async with opened(url, Inbox(), ManualClock()) as client, asyncio.timeout(5.0):
+                while client._peer is None or server._peer is None or server._peer._transport is None:
+                    await asyncio.sleep(0)
+                for end in (client, server):
+                    stream = end._peer._transport.get_extra_info("socket")
+                    assert stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 5000
+
+    run(scenario)
+
+
 def test_serial_pty_both_ways_raw() -> None:
     async def scenario() -> None:
         master, slave = os.openpty()
@@ -239,6 +362,22 @@ def test_serial_lost_device_is_opened_again(tmp_path: object) -> None:
             await inbox.until(b"back")
         os.close(slave)
         os.close(master)
+
+    run(scenario)
+
+
+def test_serial_retries_later_and_later(tmp_path: object) -> None:
+    async def scenario() -> None:
+        link = f"{tmp_path}/tty"
+        master, slave = os.openpty()
+        os.symlink(os.ttyname(slave), link)
+        clock = Waits()
+        async with opened(f"serial://{link}:57600", Inbox(), clock) as port:
+            os.unlink(link)
+            os.close(slave)
+            os.close(master)
+            waits = await waits_of(clock, 6, lambda: port.counts["failed_connects"])
+            assert waits == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0]
 
     run(scenario)
 
