@@ -12,7 +12,7 @@ import contextlib
 import json
 import math
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -21,6 +21,7 @@ from companion.errors import CompanionError
 CONNECT_S = 15.0
 HOVER_S = 30.0
 WATCH_EVERY = 5  # position updates
+ATTEMPTS = 4  # of an action that nobody answers
 COMPANION_COMPONENT = 196
 _NAV_GUIDED_ENABLE = 92
 
@@ -68,7 +69,7 @@ async def _fly(system: Any, on_step: Callable[[str], None]) -> None:
         await _until(telemetry.subscribe_health_all_ok(), lambda ok: bool(ok), step)
         for step, call in (("arm", action.arm), ("takeoff", action.takeoff)):
             on_step(step)
-            await call()
+            await _insist(call)
         step = "hover"
         on_step(step)
         # airborne first: on the ground the mode is HOLD as well
@@ -79,6 +80,18 @@ async def _fly(system: Any, on_step: Callable[[str], None]) -> None:
         await engage(direct)
     except ActionError as error:
         raise OperatorError(f"operator: {step} refused: {error}") from None
+
+
+async def _insist(call: Callable[[], Awaitable[None]]) -> None:
+    """An action, again where nobody answered it: MAVSDK gives up after two seconds, a busy machine may need more."""
+    from mavsdk.plugins.action import ActionError, ActionResult
+
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            return await call()
+        except ActionError as error:
+            if error.result is not ActionResult.TIMEOUT or attempt == ATTEMPTS:
+                raise
 
 
 async def _watch(system: Any, target_enu: tuple[float, float, float], on_step: Callable[[str], None]) -> None:
