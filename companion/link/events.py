@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from companion.link.traffic_events import TrafficEvent
 from companion.types import FloatArray, Vec3
 
 
@@ -154,4 +155,5 @@ Event: TypeAlias = (
     | SystemTime
     | SetpointEcho
     | StatusText
+    | TrafficEvent
 )

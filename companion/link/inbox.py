@@ -22,7 +22,8 @@ MAX_SOURCES = 64
 
 @dataclass(slots=True)
 class _Source:
-    queue: deque[tuple[int, bytes, str | None]] = field(default_factory=deque)  # (sequence, payload, encoding)
+    # (sequence, payload, encoding); a payload may be decoded already
+    queue: deque[tuple[int, bytes | wire.ObstacleFrame, str | None]] = field(default_factory=deque)
     arrived: int = 0  # frames so far; the next one's sequence
     announced: int = 0  # frames that the markers so far stand for
     through_ns: int | None = None  # of the newest marker
@@ -38,6 +39,7 @@ class ObstacleInbox:
         queue: frames held for a source.
         max_age_s: an older frame is rejected at the tick that would use it.
         on_report: told about rejected frames in one line, at most once a second of vehicle time.
+        doors: sources of the daemon's own (`push_decoded`); what is published under their names is rejected.
 
     ``counts`` has frames (accepted), dropped (queue full) and every reason of rejection.
     """
@@ -49,12 +51,14 @@ class ObstacleInbox:
         max_age_s: float,
         sources: Iterable[str] = (),
         on_report: Callable[[str], None] | None = None,
+        doors: Iterable[str] = (),
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._queue = queue
         self._max_age_s = max_age_s
         self._on_report = on_report
-        self._configured = tuple(sources)
+        self._doors = frozenset(doors)
+        self._configured = (*sources, *sorted(self._doors))
         self._sources = {name: _Source() for name in self._configured}
         self._unreported = 0
         self._last_rejection = ""
@@ -62,12 +66,22 @@ class ObstacleInbox:
 
     def push(self, source: str, payload: bytes, encoding: str | None = None) -> None:
         """One frame as it arrived; never raises."""
+        if source in self._doors:
+            self.reject(source, FrameRejected("reserved_source", "expected another name: this one is a MAVLink door"))
+            return
+        self._queue_up(source, payload, encoding)
+
+    def push_decoded(self, source: str, frame: wire.ObstacleFrame) -> None:
+        """One frame that a door of the daemon made itself; queued, checked and counted as all others."""
+        self._queue_up(source, frame, None)
+
+    def _queue_up(self, source: str, payload: bytes | wire.ObstacleFrame, encoding: str | None) -> None:
         entry = self._source(source)
         if entry is None:
             self.reject(source, FrameRejected("too_many_sources", f"expected at most {MAX_SOURCES} sources"))
             return
         sequence, entry.arrived = entry.arrived, entry.arrived + 1
-        if len(payload) > MAX_PAYLOAD_BYTES:
+        if isinstance(payload, bytes) and len(payload) > MAX_PAYLOAD_BYTES:
             detail = f"expected at most {MAX_PAYLOAD_BYTES} bytes, got {len(payload)}"
             self.reject(source, FrameRejected("too_large", detail))
             return
@@ -133,7 +147,7 @@ class ObstacleInbox:
                 sequence, payload, encoding = entry.queue.popleft()
                 try:
                     frame = ingress.detections_from_frame(
-                        wire.decode(payload, wire.ObstacleFrame, encoding),
+                        _decoded(payload, encoding),
                         source=name,
                         sequence=sequence,
                         now_ns=now_ns,
@@ -192,3 +206,10 @@ class ObstacleInbox:
         self._on_report(f"rejected {self._unreported} payloads, the last of {self._last_rejection}")
         self._unreported = 0
         self._reported_ns = now_ns
+
+
+def _decoded(payload: bytes | wire.ObstacleFrame, encoding: str | None) -> wire.ObstacleFrame:
+    """Raises FrameRejected as `wire.decode` does."""
+    if isinstance(payload, wire.ObstacleFrame):
+        return payload
+    return wire.decode(payload, wire.ObstacleFrame, encoding)
