@@ -61,21 +61,26 @@ def _merged(ring: ObstacleRing, zero_rad: float) -> list[tuple[Plane, float]]:
             continue
         middle_rad = zero_rad + ring.first_rad + index * ring.step_rad
         edges = [_polar(range_m, middle_rad + side * ring.step_rad) for side in (-0.5, 0.5)]
-        sphere = _about([*run, *edges])
-        if run and sphere[1] <= min(SHARE * min(nearest_m, range_m), MERGED_MAX_M):
-            run, nearest_m = [*run, *edges], min(nearest_m, range_m)
+        longer, nearer_m = [*run, *edges], min(nearest_m, range_m)
+        sphere = _about(_middle(longer), longer)
+        if run and sphere[1] <= min(SHARE * nearer_m, MERGED_MAX_M):
+            run, nearest_m = longer, nearer_m
             spheres[-1] = sphere
         else:
             run, nearest_m = edges, range_m
-            spheres.append((_polar(range_m, middle_rad), _about(edges)[1]))
+            spheres.append(_about(_polar(range_m, middle_rad), edges))
     return spheres
 
 
-def _about(points: Iterable[Plane]) -> tuple[Plane, float]:
-    """Centre of the bounding box and the radius that holds all ``points``, within bounds."""
+def _middle(points: Iterable[Plane]) -> Plane:
+    """Centre of the bounding box."""
     x, y = zip(*points, strict=True)
-    centre = 0.5 * (min(x) + max(x)), 0.5 * (min(y) + max(y))
-    reach_m = max(math.dist(centre, point) for point in zip(x, y, strict=True))
+    return 0.5 * (min(x) + max(x)), 0.5 * (min(y) + max(y))
+
+
+def _about(centre: Plane, points: Iterable[Plane]) -> tuple[Plane, float]:
+    """The sphere about ``centre`` that holds all ``points``, its radius within bounds."""
+    reach_m = max(math.dist(centre, point) for point in points)
     return centre, min(max(reach_m, RADIUS_MIN_M), RADIUS_MAX_M)
 
 

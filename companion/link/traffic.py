@@ -160,7 +160,8 @@ class TrafficDoors:
             own = True
             if name is not None:
                 self._own_names.add(name)  # others may repeat it to us
-        self._inbox.counts["traffic_own"] += own
+        if own:
+            self._inbox.counts["traffic_own"] += 1
         return own
 
     def _on_report(self, event: TrafficReport | NoPosition, unix_minus_vehicle_ns: int | None) -> None:
