@@ -208,6 +208,7 @@ class Service:
         started_ns, now_ns, session = stopwatch_ns(), self._now_ns(), self._session
         session.poll(now_ns)
         taken = self._thinker.take_frames(vehicle.stamp_ns, self._time.unix_minus_vehicle_ns)
+        self._traffic.frames_taken()
         self._route.advance(vehicle.p_enu)
         output = self._thinker.think(vehicle, taken.frames, self._route.current, now_ns)
         thought_ns = stopwatch_ns()

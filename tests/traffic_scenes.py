@@ -126,10 +126,10 @@ def vehicle(
 
 
 class Sky:
-    """A codec, the doors and the inbox, as the service wires them; lockstep time unless ``clock_ns`` is given."""
+    """A codec, the doors and the inbox, as the service wires them; a clock of None is lockstep."""
 
     def __init__(
-        self, *doors: str, clock_ns: Any = None, origin_known: bool = True, max_age_s: float = 0.5, **traffic: Any
+        self, *doors: str, clock_ns: Any = lambda: 0, origin_known: bool = True, max_age_s: float = 0.5, **traffic: Any
     ) -> None:
         self.config: Config = parse_config({"traffic": {**traffic, **{door: {"enabled": True} for door in doors}}})
         self.reports: list[str] = []

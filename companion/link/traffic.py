@@ -4,8 +4,9 @@ Global positions are placed through GPS_GLOBAL_ORIGIN, the local frame's origin 
 is asked for until it is known. Autopilots measure the local z as the difference of altitudes, so z is that, not the
 height above a tangent plane (0.3 m less at 2 km).
 
-Messages are gathered until the next vehicle state, and shown to the tick that it begins: one frame a source. What is
-refused counts in the inbox as ``traffic_<reason>``.
+Messages are gathered until the next vehicle state, and shown to the tick that it begins: one frame a source. In
+lockstep that tick's frames may have been taken before its state is here, so there they are shown to the one after it,
+always. What is refused counts in the inbox as ``traffic_<reason>``.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class TrafficDoors:
 
     Args:
         request: asks the autopilot for a message by its id.
-        elapsed_ns: our clock, for the time since the last vehicle state; None counts none of it (lockstep).
+        elapsed_ns: our clock, for the time since the last vehicle state; None: lockstep, time stands between ticks.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class TrafficDoors:
         self._arrived_ns = 0
         self._rings: dict[tuple[int, int], list[Obstacle]] = {}  # the newest of each sender
         self._points: list[Obstacle] = []
+        self._waiting: list[tuple[str, ObstacleFrame]] = []  # lockstep: for the next tick
         self._stamps: dict[str, int] = {}  # of the newest message of each of the two doors
         for reports in self._reports.values():
             reports.clear()
@@ -132,17 +134,25 @@ class TrafficDoors:
         for door, reports in self._reports.items():
             frame = reports.frame(vehicle.stamp_ns, vehicle.p_enu)
             if frame is not None:
-                self._inbox.push_decoded(door, frame)
+                self._waiting.append((door, frame))
         self._show("obstacle_distance", [obstacle for ring in self._rings.values() for obstacle in ring])
         self._show("obstacle_distance_3d", _each_name_once(self._points))
         self._rings, self._points, self._stamps = {}, [], {}
+        if self._elapsed_ns is not None:
+            self.frames_taken()
+
+    def frames_taken(self) -> None:
+        """The tick of the newest vehicle state has its frames: what is still here is for the next."""
+        waiting, self._waiting = self._waiting, []
+        for door, frame in waiting:
+            self._inbox.push_decoded(door, frame)
 
     def _show(self, door: str, obstacles: list[Obstacle]) -> None:
         stamp_ns = self._stamps.get(door)
         if stamp_ns is None or self._vehicle is None:
             return
         stamp_ns = min(stamp_ns, self._vehicle.stamp_ns)  # the state may have been long under way
-        self._inbox.push_decoded(door, ObstacleFrame(stamp_ns=stamp_ns, clock="vehicle", obstacles=obstacles))
+        self._waiting.append((door, ObstacleFrame(stamp_ns=stamp_ns, clock="vehicle", obstacles=obstacles)))
 
     def _on_origin(self, origin: TangentPlane) -> None:
         if origin != self._origin:

@@ -389,6 +389,25 @@ def test_outside_lockstep_arrival_counts_by_our_clock() -> None:
     assert frame.detections[0].p_enu[0] == pytest.approx(1.0, abs=0.05)
 
 
+def test_in_lockstep_the_tick_after_gets_them_whether_its_frames_were_taken_ahead_or_not() -> None:
+    taken = set()
+    for ahead in (False, True):
+        sky = Sky("adsb", clock_ns=None)
+        seen = []
+        for k in range(4):
+            state = vehicle(1.0 + 0.05 * k)
+            if ahead:
+                seen.append(sky.inbox.drain(state.stamp_ns))
+            sky.doors.on_vehicle(state)
+            if not ahead:
+                seen.append(sky.inbox.drain(state.stamp_ns))
+            sky.doors.frames_taken()
+            if k == 0:
+                sky.hear(adsb(P))
+        taken.add(tuple(tuple(frame.stamp_ns for frame in frames) for frames in seen))
+    assert taken == {((), (), (1_050_000_000,), ())}
+
+
 def test_a_slow_tick_gets_all_aircraft_in_one_frame() -> None:
     sky = Sky("adsb")
     sky.tick(vehicle(1.0))
