@@ -20,7 +20,7 @@ from companion.link.ingress import MAX_POSITION_M
 from companion.link.wire import Obstacle, ObstacleFrame
 from companion.types import NS_PER_S, FloatArray, Vec3
 
-MAX_HELD = 256  # aircraft of a door; beyond, the farthest goes
+MAX_HELD = 64  # aircraft of a door; beyond, the farthest goes
 SHOW_NS = NS_PER_S // 5
 MANOEUVRE_M_S2 = 2.0  # 1 sigma of each axis
 _UPPER = np.triu_indices(6)
@@ -65,6 +65,7 @@ class Reports:
 
     def clear(self) -> None:
         self._held: dict[str, Report] = {}
+        self._distance_m: dict[str, float] = {}  # of each, when it was taken
         self._fresh: set[str] = set()  # not shown yet
         self._shown_ns: int | None = None
 
@@ -73,28 +74,29 @@ class Reports:
 
         Reasons: ``traffic_far``, ``traffic_many`` (the farthest of too many).
         """
-        distance_m = _distance(report, own_enu)
+        distance_m = math.dist(report.p_enu, own_enu)
         if distance_m > self._max_range_m or float(np.abs(report.p_enu).max()) > MAX_POSITION_M:
             self._forget(name)
             return "traffic_far"
         if name not in self._held and len(self._held) >= MAX_HELD:
-            farthest = max(self._held, key=lambda held: _distance(self._held[held], own_enu))
-            if _distance(self._held[farthest], own_enu) <= distance_m:
+            farthest = max(self._distance_m, key=self._distance_m.__getitem__)
+            if self._distance_m[farthest] <= distance_m:
                 return "traffic_many"
             self._forget(farthest)
-        self._held[name] = report
+        self._held[name], self._distance_m[name] = report, distance_m
         self._fresh.add(name)
         return None
 
     def frame(self, stamp_ns: int, own_enu: Vec3) -> ObstacleFrame | None:
-        """What is in the air at ``stamp_ns``, where that is due: at once after a report, else five times a second."""
+        """What is to be shown at ``stamp_ns``: a new report at once, all that is in the air five times a second."""
         if not self._held:
             return None
         due = self._shown_ns is None or not 0 <= stamp_ns - self._shown_ns < SHOW_NS
         if not self._fresh and not due:
             return None
         shown = []
-        for name, report in list(self._held.items()):
+        for name in list(self._held) if due else sorted(self._fresh):
+            report = self._held[name]
             silent = report.v_enu is None or stamp_ns - report.stamp_ns > self._carry_ns
             if silent and name not in self._fresh:
                 self._forget(name)
@@ -103,13 +105,14 @@ class Reports:
             if math.dist(p_enu, own_enu) <= self._max_range_m and float(np.abs(p_enu).max()) <= MAX_POSITION_M:
                 shown.append(self._obstacle(name, report, p_enu, covariance))
         self._fresh.clear()
-        self._shown_ns = stamp_ns
+        self._shown_ns = stamp_ns if due else self._shown_ns
         if not shown:
             return None
         return ObstacleFrame(stamp_ns=stamp_ns, clock="vehicle", kind="track", obstacles=shown)
 
     def _forget(self, name: str) -> None:
         self._held.pop(name, None)
+        self._distance_m.pop(name, None)
         self._fresh.discard(name)
 
     def _obstacle(self, name: str, report: Report, p_enu: Vec3, covariance: FloatArray) -> Obstacle:
@@ -125,7 +128,3 @@ class Reports:
             velocity=velocity,
             covariance=covariance[_UPPER].tolist(),
         )
-
-
-def _distance(report: Report, own_enu: Vec3) -> float:
-    return math.dist(report.p_enu, own_enu)

@@ -411,9 +411,12 @@ def test_in_lockstep_the_tick_after_gets_them_whether_its_frames_were_taken_ahea
 def test_a_slow_tick_gets_all_aircraft_in_one_frame() -> None:
     sky = Sky("adsb")
     sky.tick(vehicle(1.0))
-    sky.hear(*(adsb(P, ICAO_address=number) for number in range(100)))
+    sky.hear(*(adsb(P, ICAO_address=number) for number in range(50)))
     (frame,) = sky.tick(vehicle(1.0))
-    assert len(frame.detections) == 100
+    assert len(frame.detections) == 50
+    sky.hear(adsb(P, ICAO_address=7))
+    assert one(sky.tick(vehicle(1.05)), "adsb").id == "adsb-000007"  # at once; the others when they are due
+    assert len(sky.tick(vehicle(1.2))[0].detections) == 50
 
 
 # --- the inbox and the configuration -------------------------------------------------------------------------------
@@ -429,7 +432,7 @@ def test_nobody_else_speaks_under_the_name_of_a_door() -> None:
 def test_a_full_queue_of_a_door_is_bounded_as_all_others() -> None:
     sky = Sky("adsb")
     for number in range(100):
-        sky.hear(adsb(P, ICAO_address=number))
+        sky.hear(adsb(P, ICAO_address=number % 5))
         sky.doors.on_vehicle(vehicle(1.0 + 0.001 * number))
     assert len(sky.inbox.drain(round(1.1 * S))) == 64
     assert sky.inbox.counts["dropped"] == 99 - 64
