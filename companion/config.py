@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from companion.config_check import check_arena, check_confirmation, check_reserve, check_ros2, check_tick, pointed
+from companion.config_traffic import UNTRUSTED, TrafficConfig, check_traffic
 from companion.errors import ConfigError
 from companion.profiles import PROFILES, Profile
 
@@ -132,7 +133,7 @@ class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=T
     confirm_hits: Annotated[int, Meta(ge=1, le=20)] = 2  # detections that confirm an anonymous track; 1: at once
     confirm_frames: Annotated[int, Meta(ge=1, le=100)] = 3  # of its source after the first in which they must come
     merge_s: Annotated[float, Meta(ge=0.0, le=60.0)] = 1.0  # tracks that agree for this long become one; 0: never
-    untrusted: tuple[SourceName, ...] = ()  # sources that may add obstacles but never move or end those of others
+    untrusted: tuple[SourceName, ...] = UNTRUSTED  # they may add obstacles but never move or end those of others
 
 
 class PolicyConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -213,6 +214,7 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     engage: EngageConfig = EngageConfig()
     obstacles: ObstaclesConfig = ObstaclesConfig()
     ros2: Ros2Config = Ros2Config()
+    traffic: TrafficConfig = TrafficConfig()
     tracking: TrackingConfig = TrackingConfig()
     policy: PolicyConfig = PolicyConfig()
     safety: SafetyConfig = SafetyConfig()
@@ -300,6 +302,7 @@ def parse_config(raw: Mapping[str, Any], *, source: str = "configuration") -> Co
     if config.disturbance.enabled:
         check_reserve(config.limits.acceleration_m_s2, config.disturbance.bound_m_s2, source)
     check_confirmation(config.tracking.confirm_hits, config.tracking.confirm_frames, source)
+    check_traffic(config.traffic, config.tracking.untrusted, source)
     check_arena(config.limits.arena_min, config.limits.arena_max, config.target.position, source)
     check_ros2((*config.ros2.detections, *config.ros2.tracked_objects), config.sync, source)
     if config.sync == "none" and config.lockstep_sources:

@@ -23,6 +23,8 @@ from companion.link.mavlink import MavlinkCodec, packet_count
 from companion.link.params import ParamRequest
 from companion.link.router import Router
 from companion.link.signing_files import open_signing
+from companion.link.traffic import TrafficDoors
+from companion.link.traffic_events import TrafficEvent
 from companion.link.zenoh import ZenohLink
 from companion.metrics import Summary, TickMeter
 from companion.microservices import Microservices
@@ -65,6 +67,13 @@ class Service:
             max_age_s=config.obstacles.max_age_s,
             sources=(*config.lockstep_sources, *config.obstacles.required),
             on_report=log.warning,
+            doors=config.traffic.open_doors,
+        )
+        self._traffic = TrafficDoors(
+            config.traffic,
+            self._inbox,
+            self._session.request_message,
+            elapsed_ns=None if self._lockstep else clock.monotonic_ns,
         )
         self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
         self._time = TimeBase(clock, self._codec, self._transport.send, self._on_reboot)
@@ -200,6 +209,7 @@ class Service:
         started_ns, now_ns, session = stopwatch_ns(), self._now_ns(), self._session
         session.poll(now_ns)
         taken = self._thinker.take_frames(vehicle.stamp_ns, self._time.unix_minus_vehicle_ns)
+        self._traffic.frames_taken()
         self._route.advance(vehicle.p_enu)
         output = self._thinker.think(vehicle, taken.frames, self._route.current, now_ns)
         thought_ns = stopwatch_ns()
@@ -242,6 +252,7 @@ class Service:
         if not self._lockstep:
             self._session.poll(now_ns)
             self._time.poll()
+        self._traffic.poll(now_ns)
         last = self._last_beat
         if last is None or now_ns - last[0] >= HEARTBEAT_NS or wall_ns - last[1] >= HEARTBEAT_NS:
             self._last_beat = (now_ns, wall_ns)
@@ -295,6 +306,8 @@ class Service:
                 self._time.handle(event, self._session.system)
             elif isinstance(event, ParamRequest):
                 self._services.handle(event)
+            elif isinstance(event, TrafficEvent):
+                self._traffic.handle(event, self._session.system, self._time.unix_minus_vehicle_ns)
             elif (vehicle := self._session.handle(event, self._now_ns())) is not None:
                 self._on_vehicle(vehicle)
         self._flush()
@@ -314,6 +327,7 @@ class Service:
         self._vehicle_ns = vehicle.stamp_ns
         self._arrived_ns = stopwatch_ns()
         self._pending_since_ns = self._clock.monotonic_ns()
+        self._traffic.on_vehicle(vehicle)
         self._session.heard_vehicle(self._now_ns())
         self._wake.set()
 
@@ -327,6 +341,7 @@ class Service:
         self._pending = None
         self._vehicle_ns = 0
         self._thinker.reset()
+        self._traffic.reset()
         self._session.rebooted()
 
     def _retune(self, config: Config) -> None:

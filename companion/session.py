@@ -132,6 +132,11 @@ class VehicleSession:
         """A STATUSTEXT for the operator: at the next `poll`, not twice in a row, never a flood."""
         self._texts.push(severity, text)
 
+    def request_message(self, message: int) -> None:
+        """Ask the autopilot, once it is known, for one message."""
+        if self._system is not None:
+            self._outgoing.append(self._codec.encode_request_message(message))
+
     def rebooted(self) -> None:
         """The autopilot began anew: it forgot which messages it was asked for."""
         self._asked_ns.clear()

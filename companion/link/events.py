@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from companion.link.params import ParamRequest
+from companion.link.traffic_events import TrafficEvent
 from companion.types import FloatArray, Vec3
 
 
@@ -156,4 +157,5 @@ Event: TypeAlias = (
     | SetpointEcho
     | StatusText
     | ParamRequest
+    | TrafficEvent
 )

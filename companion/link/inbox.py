@@ -41,6 +41,7 @@ class ObstacleInbox:
         queue: frames held for a source.
         max_age_s: an older frame is rejected at the tick that would use it.
         on_report: told about rejected frames in one line, at most once a second of vehicle time.
+        doors: sources of the daemon's own (`push_decoded`); what is published under their names is rejected.
 
     ``counts`` has frames (accepted), dropped (queue full) and every reason of rejection.
     """
@@ -52,12 +53,14 @@ class ObstacleInbox:
         max_age_s: float,
         sources: Iterable[str] = (),
         on_report: Callable[[str], None] | None = None,
+        doors: Iterable[str] = (),
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._queue = queue
         self._max_age_s = max_age_s
         self._on_report = on_report
-        self._configured = tuple(sources)
+        self._doors = frozenset(doors)
+        self._configured = (*sources, *sorted(self._doors))
         self._sources = {name: _Source() for name in self._configured}
         self._unreported = 0
         self._last_rejection = ""
@@ -69,6 +72,9 @@ class ObstacleInbox:
 
     def push(self, source: str, payload: bytes, encoding: str | None = None) -> None:
         """One frame as it arrived; never raises."""
+        if source in self._doors:
+            self.reject(source, FrameRejected("reserved_source", "expected another name: this one is a MAVLink door"))
+            return
         self._enqueue(source, payload, encoding)
 
     def push_decoded(self, source: str, frame: wire.ObstacleFrame | Callable[[], wire.ObstacleFrame]) -> None:

@@ -17,6 +17,8 @@ MAX_RADIUS_M = 100.0
 MAX_SPEED_M_S = 1e3
 MAX_STD_M = 1e4
 FUTURE_NS = NS_PER_S // 10
+_UPPER = np.triu_indices(6)
+_LOWER = _UPPER[::-1]
 
 
 def detections_from_frame(
@@ -117,9 +119,9 @@ def _detection(index: int, obstacle: Obstacle, ned: bool) -> Detection:
 
 
 def _covariance(at: str, values: list[float], ned: bool) -> FloatArray:
-    matrix = np.zeros((6, 6))
-    matrix[np.triu_indices(6)] = values
-    matrix = np.triu(matrix) + np.triu(matrix, 1).T
-    if not np.isfinite(matrix).all() or np.abs(matrix).max() > MAX_STD_M**2 or np.linalg.eigvalsh(matrix)[0] <= 0.0:
+    matrix = np.empty((6, 6))
+    matrix[_UPPER] = matrix[_LOWER] = values
+    # NaN fails the first, too
+    if not np.abs(matrix).max() <= MAX_STD_M**2 or np.linalg.eigvalsh(matrix)[0] <= 0.0:
         raise FrameRejected("out_of_range", f"{at}.covariance: expected a finite positive definite 6x6 upper triangle")
     return frozen(enu_covariance_from_ned(matrix) if ned else matrix)

@@ -17,12 +17,14 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from companion.errors import CompanionError
 from companion.link import mav, params
 from companion.link.decode import DECODERS, Rejected, TextAssembler, command
+from companion.link.decode_traffic import TRAFFIC_DECODERS
 from companion.link.events import Command, Event
 from companion.link.framing import Framer
 from companion.link.signing import FLAG_SIGNED, SIGNATURE_BLOCK, Signing
 from companion.profiles import ModeRequest
 from companion.types import Vec3
 
+_DECODERS = {**DECODERS, **TRAFFIC_DECODERS}
 _MAX_SETPOINT = 1e3  # [m/s^2], [m/s], [rad/s]
 _MASK_BITS = 0x0FFF
 _TEXT_BYTES = 50
@@ -99,7 +101,7 @@ class MavlinkCodec:
         events: list[Event] = []
         for message in messages:
             kind = message.get_msgId()  # not .id: STATUSTEXT has a field of that name
-            decode = DECODERS.get(kind)
+            decode = _DECODERS.get(kind)
             try:
                 if decode is not None:
                     events.extend(decode(message))

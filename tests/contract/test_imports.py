@@ -16,7 +16,7 @@ PACKAGES = ("companion", "sim_bridge", "policies")
 LAYERS = [
     {"companion", "companion.__version__", "companion.types", "companion.errors"},
     {"companion.frames", "companion.profiles", "companion.clock"},
-    {"companion.config", "companion.config_check"},
+    {"companion.config", "companion.config_check", "companion.config_traffic"},
     {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload"},
     {"companion.tracking", "companion.safety", "companion.policy", "companion.torch_backend", "companion.disturbance"},
     {"companion.pilot"},
@@ -100,7 +100,7 @@ def test_companion_imports_flow_one_way(path: Path) -> None:
 
 
 def test_link_knows_types_and_frames_only() -> None:
-    allowed = {"types", "errors", "frames", "profiles", "clock", "config", "link"}
+    allowed = {"types", "errors", "frames", "profiles", "clock", "config", "config_traffic", "link"}
     for path in modules("companion/link"):
         for name in imported(path):
             if name.startswith("companion."):
