@@ -98,7 +98,7 @@ class Publisher:
         """The status, at 5 Hz and whenever the situation or the target changed."""
         situation = session.situation
         target = None if target_enu is None else tuple(target_enu.tolist())
-        key = (situation, target)
+        key = (situation, target, session.watch.notices.standing)
         changed = self._last is None or self._last[1] != key
         if not changed and self._last is not None and now_ns - self._last[0] < STATUS_NS:
             return
@@ -112,6 +112,8 @@ class Publisher:
             engaged=situation.engaged,
             armed=session.armed,
             airborne=situation.airborne,
+            profile=session.config.vehicle.profile,
+            warnings=list(session.watch.notices.standing),
             target=target,
             tracks=self._tracks,
             agile=self._agile,

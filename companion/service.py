@@ -15,13 +15,14 @@ from pathlib import Path
 from companion.clock import Clock, stopwatch_ns
 from companion.config import Config
 from companion.doors import Doors
-from companion.errors import CompanionError, LockstepStalled
+from companion.errors import CompanionError
 from companion.link import mav
 from companion.link.events import TimesyncReply, TimesyncRequest
 from companion.link.inbox import ObstacleInbox
 from companion.link.mavlink import MavlinkCodec, packet_count
 from companion.link.transports import Transport, open_transport
 from companion.link.zenoh import ZenohLink
+from companion.lockstep import LockstepBarrier
 from companion.metrics import Summary, TickMeter
 from companion.pilot import Pilot, PilotOutput
 from companion.publisher import Publisher
@@ -37,8 +38,6 @@ from companion.types import NS_PER_S, VehicleState
 log = logging.getLogger("companion")
 
 HEARTBEAT_NS = NS_PER_S
-GONE_NS = 5 * NS_PER_S  # lockstep: not even a heartbeat of the simulator
-STALL_NS = NS_PER_S  # lockstep: no progress for this much wall time ends the run
 WAKE_S = 0.2  # of wall time: heartbeats, timeouts and the stall guard need no telemetry
 RELEASE_NS = 6 * NS_PER_S // 10  # on shutdown in flight the autopilot is given this long to show its hold mode
 
@@ -59,15 +58,16 @@ class Service:
         self._lockstep = config.sync == "lockstep"
         self._codec = MavlinkCodec(system=config.mavlink.system_id or 1)
         self._route = Route(config.target, config.limits)
-        self._session = VehicleSession(config, self._codec, self._route.set_position)
+        self._session = VehicleSession(config, self._codec, self._route.set_position, self._on_profile)
         self._inbox = ObstacleInbox(
             queue=config.obstacles.queue,
             max_age_s=config.obstacles.max_age_s,
             sources=(*config.lockstep_sources, *config.obstacles.required),
             on_report=log.warning,
         )
+        self._barrier = LockstepBarrier(config, self._inbox, clock)
         self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
-        self._time = TimeBase(clock, self._codec, self._send, self._on_reboot)
+        self._time = TimeBase(clock, self._codec, self._send, self._on_restart, runs=not self._lockstep)
         self._meter = TickMeter(1.0 / config.rate_hz)
         self._publisher: Publisher
         self._doors = Doors(
@@ -84,9 +84,7 @@ class Service:
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
         self._arrived_ns = 0  # its arrival, for the latency figure
-        self._pending_since_ns = 0
         self._vehicle_ns = 0  # vehicle time of the newest state
-        self._heard_wall_ns: int | None = None  # any bytes from the vehicle's link
         self._log_failed = False
         self._last_beat: tuple[int, int] | None = None
         self._transport: Transport
@@ -156,12 +154,12 @@ class Service:
             self._wake.clear()
             if self._stopping and deadline_ns is None:
                 deadline_ns = self._begin_shutdown()
-            if self._pending is not None and self._inputs_complete(self._pending):
+            if self._pending is not None and self._barrier.passes(self._pending.stamp_ns):
                 vehicle, self._pending = self._pending, None
                 self._tick(vehicle)
             elif self._pending is None and self._lockstep:
                 self._thinker.observe_ahead(self._vehicle_ns, self._now_ns())
-                self._check_simulator()
+                self._barrier.check_simulator(self._vehicle_ns)
             self._housekeeping()
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
@@ -176,24 +174,6 @@ class Service:
             self._flush()
         return self._clock.monotonic_ns() + RELEASE_NS
 
-    def _inputs_complete(self, vehicle: VehicleState) -> bool:
-        """In lockstep: whether every source's marker and frames for this tick are there."""
-        sources = self._config.lockstep_sources
-        if not self._lockstep or self._inbox.ready(vehicle.stamp_ns, sources):
-            return True
-        if self._clock.monotonic_ns() - self._pending_since_ns > STALL_NS:
-            missing = self._inbox.missing(vehicle.stamp_ns, sources)
-            raise LockstepStalled(f"lockstep: no progress for 1 s at tick {vehicle.stamp_ns}: missing {missing}")
-        return False
-
-    def _check_simulator(self) -> None:
-        """In lockstep: a simulator that holds time still sends heartbeats; one that is gone sends nothing."""
-        heard_ns = self._heard_wall_ns
-        if heard_ns is not None and self._clock.monotonic_ns() - heard_ns > GONE_NS:
-            raise LockstepStalled(
-                f"lockstep: nothing from the vehicle for {GONE_NS / 1e9:g} s after {self._vehicle_ns} ns"
-            )
-
     def _tick(self, vehicle: VehicleState) -> None:
         """One vehicle state in, one record out, and a setpoint where the state of the daemon sends one."""
         started_ns, now_ns, session = stopwatch_ns(), self._now_ns(), self._session
@@ -206,6 +186,7 @@ class Service:
         if output is not None and session.streams:
             with self._thinker.fault_on_error(now_ns):
                 self._send_setpoint(vehicle, output)
+                session.sent_setpoint(output.wire, now_ns)
                 sent = True
         messages = self._flush()
         sent_ns = stopwatch_ns()
@@ -222,11 +203,9 @@ class Service:
         self._meter.tick(timings_ms["total"], busy_ms, record.verdict)
 
     def _send_setpoint(self, vehicle: VehicleState, output: PilotOutput) -> None:
-        self._transport.send(
-            self._codec.encode_setpoint(
-                vehicle.stamp_ns // 1_000_000, output.wire, self._config.profile.type_mask, v_enu=vehicle.v_enu
-            )
-        )
+        """Acceleration, and where the mask uses it the velocity that the vehicle should then have."""
+        stamp_ms, mask = vehicle.stamp_ns // 1_000_000, self._config.type_mask
+        self._transport.send(self._codec.encode_setpoint(stamp_ms, output.wire, mask, v_enu=output.v_next))
 
     # housekeeping
 
@@ -285,6 +264,8 @@ class Service:
             **{f"obstacles.{name}": count for name, count in sorted(self._inbox.counts.items())},
             **{f"tracking.{name}": count for name, count in sorted(self._thinker.tracking_counts.items())},
             **{f"mavlink.{name}": count for name, count in sorted(self._codec.counts.items())},
+            **{f"autopilot.{name}": count for name, count in sorted(self._session.watch.counts.items())},
+            **{f"timesync.{name}": count for name, count in sorted(self._time.counts.items())},
             "deadline_misses": meter.deadline_misses,
             "states_skipped": meter.states_skipped,
         }
@@ -306,7 +287,7 @@ class Service:
     # what the links hand in
 
     def _on_bytes(self, data: bytes) -> None:
-        self._heard_wall_ns = self._clock.monotonic_ns()
+        self._barrier.heard()
         for event in self._codec.receive(data):
             if isinstance(event, TimesyncRequest | TimesyncReply):
                 self._time.handle(event, self._session.system)
@@ -316,8 +297,7 @@ class Service:
 
     def _on_vehicle(self, vehicle: VehicleState) -> None:
         """A new vehicle state; only the newest waits for the control task."""
-        if self._time.rebooted(vehicle.stamp_ns):
-            self._on_reboot()
+        self._time.note(vehicle.stamp_ns)
         if self._is_stale(vehicle.stamp_ns):
             self._meter.skip()
             return
@@ -328,7 +308,7 @@ class Service:
         self._pending = vehicle
         self._vehicle_ns = vehicle.stamp_ns
         self._arrived_ns = stopwatch_ns()
-        self._pending_since_ns = self._clock.monotonic_ns()
+        self._barrier.pending()
         self._session.heard_vehicle(self._now_ns())
         self._wake.set()
 
@@ -337,12 +317,19 @@ class Service:
         age_ns = None if self._lockstep else self._time.age_ns(stamp_ns)
         return age_ns is not None and age_ns > self._config.vehicle.stale_s * NS_PER_S
 
-    def _on_reboot(self) -> None:
-        log.warning("the autopilot rebooted: tracks, queues and clock offset start anew")
+    def _on_profile(self, config: Config) -> None:
+        """`vehicle.profile = "auto"` is settled; nothing was sent before."""
+        log.info("profile %s", config.vehicle.profile)
+        self._config = config
+        self._thinker.adopt(config)
+        self._meter.set_period(1.0 / config.rate_hz)
+
+    def _on_restart(self, why: str) -> None:
+        log.warning("%s: tracks, queues and clock offset start anew", why)
         self._pending = None
         self._vehicle_ns = 0
         self._thinker.reset()
-        self._session.rebooted()
+        self._session.clock_restarted(why, self._now_ns())
 
     def _on_change(self) -> None:
         """A command or a marker came by Zenoh: answer the autopilot and look again."""

@@ -20,16 +20,25 @@ class TimeBase:
 
     Args:
         send: puts bytes on the vehicle's link.
-        on_reboot: called when a reply shows that the vehicle's clock began anew.
+        on_restart: called with the reason when a stamp or a reply shows that the vehicle's clock began anew or jumped:
+            whatever was dated by it is worth nothing.
+        runs: whether the vehicle's clock runs beside ours; in lockstep it does not, and only a step back is noticed.
     """
 
     def __init__(
-        self, clock: Clock, codec: MavlinkCodec, send: Callable[[bytes], None], on_reboot: Callable[[], None]
+        self,
+        clock: Clock,
+        codec: MavlinkCodec,
+        send: Callable[[bytes], None],
+        on_restart: Callable[[str], None],
+        *,
+        runs: bool = True,
     ) -> None:
         self._clock = clock
         self._codec = codec
         self._send = send
-        self._on_reboot = on_reboot
+        self._on_restart = on_restart
+        self._runs = runs
         self._timesync = TimeSync()
         self._asked_ns: int | None = None
 
@@ -55,14 +64,28 @@ class TimeBase:
             return
         if (event.system, event.component) != (system, mav.AUTOPILOT_COMPONENT):
             return
-        reboots = self._timesync.counts["reboots"]
+        before = self._breaks
         self._timesync.reply(tc1_ns=event.tc1_ns, ts1_ns=event.ts1_ns, now_ns=now_ns, unix_ns=self._clock.unix_ns())
-        if self._timesync.counts["reboots"] > reboots:
-            self._on_reboot()
+        self._tell(before)
 
-    def rebooted(self, stamp_ns: int) -> bool:
-        """Note a stamp of the vehicle's clock; True where it went back."""
-        return self._timesync.vehicle_time(stamp_ns)
+    def note(self, stamp_ns: int) -> None:
+        """Note the stamp of a vehicle state."""
+        before = self._breaks
+        self._timesync.vehicle_time(stamp_ns, self._clock.monotonic_ns() if self._runs else None)
+        self._tell(before)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What TIMESYNC counts."""
+        return dict(self._timesync.counts)
+
+    @property
+    def _breaks(self) -> tuple[int, int]:
+        return self._timesync.counts["reboots"], self._timesync.counts["jumps_ahead"]
+
+    def _tell(self, before: tuple[int, int]) -> None:
+        if self._breaks != before:
+            self._on_restart("autopilot rebooted" if self._breaks[0] > before[0] else "vehicle clock jumped ahead")
 
     def age_ns(self, stamp_ns: int) -> int | None:
         """How long ago the vehicle stamped, None until settled."""

@@ -56,6 +56,10 @@ class Tracker:
         self._now_ns = 0
         self._picture = empty_picture(self._constants)
 
+    def forget_path(self) -> None:
+        """The vehicle's local frame moved: where it was does not tell any more which detections are its own."""
+        self._path.reset()
+
     def __len__(self) -> int:
         return int(self._visible().sum())
 

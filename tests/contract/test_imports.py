@@ -17,12 +17,27 @@ LAYERS = [
     {"companion", "companion.__version__", "companion.types", "companion.errors"},
     {"companion.frames", "companion.profiles", "companion.clock"},
     {"companion.config", "companion.config_check"},
-    {"companion.tracking", "companion.safety", "companion.policy", "companion.torch_backend", "companion.disturbance"},
+    {
+        "companion.tracking",
+        "companion.safety",
+        "companion.policy",
+        "companion.torch_backend",
+        "companion.disturbance",
+        "companion.origin",
+    },
     {"companion.pilot"},
     {"companion.state"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
     {
+        "companion.notices",
+        "companion.confirm",
+        "companion.requests",
+        "companion.modes",
+        "companion.watch",
+    },
+    {
         "companion.latch",
+        "companion.lockstep",
         "companion.session",
         "companion.timebase",
         "companion.thinker",
@@ -39,6 +54,7 @@ BRAIN = (
     "companion/torch_backend.py",
     "companion/pilot.py",
     "companion/disturbance.py",
+    "companion/origin.py",
 )
 NOT_IN_BRAIN = {"asyncio", "socket", "time", "random", "os", "logging", "threading", "datetime"}
 HEAVY = {"torch", "pybullet", "matplotlib", "filterpy", "mavsdk", "stable_baselines3", "gymnasium"}
