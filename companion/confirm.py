@@ -34,6 +34,7 @@ class Confirmation:
     def __init__(self, profile: Profile, type_mask: int) -> None:
         self._bits = profile.echo_bits
         self._mask = type_mask
+        self._compares_acceleration = profile.echo_exact or bool(type_mask & mav.IGNORE_VELOCITY)
         self.counts: Counter[str] = Counter()
         self.reset()
 
@@ -64,7 +65,7 @@ class Confirmation:
         differs = bool((echo.type_mask ^ self._mask) & self._bits)
         self.counts["mask_mismatch"] += differs
         self._wrong_mask = echo.type_mask if differs else None
-        if differs or not self._compares_acceleration:
+        if differs or not self._compares_acceleration or echo.type_mask & mav.IGNORE_ACCELERATION:
             return
         foreign = not self._is_ours(echo.a_enu)
         self.counts["foreign_acceleration"] += foreign
@@ -81,11 +82,6 @@ class Confirmation:
         if self._foreign >= FOREIGN_ECHOES:
             return "autopilot follows an acceleration that is not ours: a second sender?"
         return None
-
-    @property
-    def _compares_acceleration(self) -> bool:
-        """With a velocity beside it an autopilot's acceleration also holds what its velocity loop adds."""
-        return bool(self._bits & mav.IGNORE_ACCELERATION and self._mask & mav.IGNORE_VELOCITY)
 
     def _is_ours(self, a_enu: Vec3) -> bool:
         sent = np.array([a for _, a in self._sent])

@@ -13,7 +13,8 @@ vertical, first velocity 0.21 s after a step) is the dead time.
 
 Confirmation: POSITION_TARGET_LOCAL_NED repeats what the autopilot follows, under a mask of its own making. ArduPilot
 writes the mask of its guided submode, yaw always ignored; PX4 marks the numbers that are not finite after its position
-controller, which may have filled the velocities. ``echo_bits`` are the bits that can be compared with what was sent.
+controller, which may have filled the velocities and adds what its velocity loop asks to the accelerations.
+``echo_bits`` are the bits that can be compared with what was sent.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ class Profile:
     streams_when_ready: bool  # PX4 wants a stream before it grants offboard
     engage_by: str  # default of engage.by: "command" or "mode_switch"
     echo_bits: int  # bits of POSITION_TARGET_LOCAL_NED's mask that repeat those sent
+    echo_exact: bool  # whether its acceleration is the one sent, also beside a velocity
 
     def mask(self, setpoint: str) -> int:
         """POSITION_TARGET_TYPEMASK of ``vehicle.setpoint`` "acceleration" or "velocity+acceleration"."""
@@ -85,6 +87,7 @@ PROFILES: dict[str, Profile] = {
             streams_when_ready=True,
             engage_by="command",
             echo_bits=ECHO_ALL,
+            echo_exact=True,
         ),
         Profile(
             name="px4",
@@ -99,6 +102,7 @@ PROFILES: dict[str, Profile] = {
             streams_when_ready=True,
             engage_by="mode_switch",
             echo_bits=ECHO_NO_VELOCITY,
+            echo_exact=False,
         ),
         Profile(
             name="ardupilot",
@@ -113,6 +117,7 @@ PROFILES: dict[str, Profile] = {
             streams_when_ready=False,
             engage_by="command",
             echo_bits=ECHO_AXES,
+            echo_exact=True,
         ),
     )
 }
@@ -136,4 +141,5 @@ UNDECIDED = Profile(
     streams_when_ready=False,
     engage_by="command",
     echo_bits=0,
+    echo_exact=False,
 )

@@ -77,7 +77,7 @@ class TimeBase:
     @property
     def counts(self) -> dict[str, int]:
         """What TIMESYNC counts."""
-        return dict(self._timesync.counts)
+        return dict(+self._timesync.counts)
 
     @property
     def _breaks(self) -> tuple[int, int]:

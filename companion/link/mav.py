@@ -76,6 +76,8 @@ def autopilot_name(autopilot: int) -> str:
     >>> autopilot_name(12), autopilot_name(200)
     ('PX4', 'autopilot 200')
     """
+    if autopilot == 3:
+        return "ArduPilot"  # the dialect still calls it ARDUPILOTMEGA
     entry = dialect.enums["MAV_AUTOPILOT"].get(autopilot)
     return f"autopilot {autopilot}" if entry is None else str(entry.name).removeprefix("MAV_AUTOPILOT_")
 

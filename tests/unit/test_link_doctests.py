@@ -8,7 +8,7 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("name", ["link.mavlink", "link.timesync", "link.url", "publish"])
+@pytest.mark.parametrize("name", ["link.mav", "link.mavlink", "link.timesync", "link.url", "notices", "publish"])
 def test_docstring_examples(name: str) -> None:
     outcome = doctest.testmod(importlib.import_module(f"companion.{name}"))
     assert outcome.attempted > 0
