@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 
 import msgspec
 
+from companion.config import Config
 from companion.link import wire
 from companion.link.zenoh import ZenohLink
 from companion.metrics import TickMeter
@@ -40,6 +41,11 @@ class Publisher:
     @property
     def log_hash(self) -> str:
         return self._hash.hexdigest()
+
+    def configured(self, config: Config) -> None:
+        """The profile is settled: the log says with which configuration it is flown."""
+        if self._recorder is not None:
+            self._recorder.configured(config)
 
     def tick(
         self,

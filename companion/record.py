@@ -49,13 +49,17 @@ class Recorder:
         self._open = True
         self._writer: Any = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         self._channels: dict[str, int] = {}
-        head = {"version": __version__, "hash": config_hash(config), "config": msgspec.to_builtins(config)}
         try:
             self._start()
         except OSError as error:
             self._fail(error)
-        self.message("/companion/config", 0, _ENCODER.encode(head))
+        self.configured(config)
         self.flush()
+
+    def configured(self, config: Config) -> None:
+        """Append the resolved configuration; again where the profile is settled by the heartbeat: the last is flown."""
+        head = {"version": __version__, "hash": config_hash(config), "config": msgspec.to_builtins(config)}
+        self.message("/companion/config", 0, _ENCODER.encode(head))
 
     def message(self, topic: str, stamp_ns: int, payload: bytes) -> None:
         """Append one JSON message."""

@@ -68,6 +68,7 @@ class Service:
         self._barrier = LockstepBarrier(config, self._inbox, clock)
         self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
         self._time = TimeBase(clock, self._codec, self._send, self._on_restart, runs=not self._lockstep)
+        self._time.on_step = self._session.watch.unix_stepped
         self._meter = TickMeter(1.0 / config.rate_hz)
         self._publisher: Publisher
         self._doors = Doors(
@@ -322,6 +323,7 @@ class Service:
         log.info("profile %s", config.vehicle.profile)
         self._config = config
         self._thinker.adopt(config)
+        self._publisher.configured(config)
         self._meter.set_period(1.0 / config.rate_hz)
 
     def _on_restart(self, why: str) -> None:
@@ -329,7 +331,8 @@ class Service:
         self._pending = None
         self._vehicle_ns = 0
         self._thinker.reset()
-        self._session.clock_restarted(why, self._now_ns())
+        self._session.rebooted()
+        self._session.watch.clock_restarted(why, self._now_ns())
 
     def _on_change(self) -> None:
         """A command or a marker came by Zenoh: answer the autopilot and look again."""

@@ -129,15 +129,6 @@ class VehicleSession:
         self.watch.restart()
         self._attitude = self._reset_counter = None
 
-    def clock_restarted(self, why: str, now_ns: int) -> None:
-        """The vehicle's clock began anew or jumped, which is how a reboot shows first; told."""
-        self.rebooted()
-        self.watch.notices.happened("clock_restarts", f"{why}: tracks and time base start anew", now_ns)
-
-    def origin_moved(self, moved_m: float, now_ns: int) -> None:
-        """The estimator was reset: targets and the arena now lie elsewhere on the ground; told."""
-        self.watch.notices.happened("origin_resets", f"estimator reset: the origin moved by {moved_m:.1f} m", now_ns)
-
     def sent_setpoint(self, a_enu: Vec3, now_ns: int) -> None:
         """A setpoint left; the autopilot confirms those it obeys."""
         if self._obeyed:

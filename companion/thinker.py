@@ -99,7 +99,7 @@ class Thinker:
             output = self._pilot.step(inputs, sent=self._session.streams and situation.external)
             self._policy_valid = output.policy_valid
             if output.origin_moved_m is not None:
-                self._session.origin_moved(output.origin_moved_m, now_ns)
+                self._session.watch.origin_moved(output.origin_moved_m, now_ns)
         return output
 
     @contextlib.contextmanager

@@ -13,6 +13,7 @@ from companion.types import NS_PER_S
 
 EVERY_NS = NS_PER_S
 SETTLING_NS = NS_PER_S // 10
+STEP_NS = NS_PER_S // 10  # unix time set by more than this at once is told
 
 
 class TimeBase:
@@ -41,15 +42,19 @@ class TimeBase:
         self._runs = runs
         self._timesync = TimeSync()
         self._asked_ns: int | None = None
+        self._unix_minus_ours_ns: int | None = None
+        self.on_step: Callable[[float, int], None] = lambda step_s, now_ns: None  # unix time was set; by how much, when
 
     @property
     def unix_minus_vehicle_ns(self) -> int | None:
-        """Unix time minus the vehicle's clock, None until settled."""
-        return self._timesync.unix_minus_vehicle_ns
+        """Unix time minus the vehicle's clock, None until settled; follows at once where unix time is set."""
+        offset_ns = self._timesync.ours_minus_vehicle_ns
+        return None if offset_ns is None else offset_ns + self._clock.unix_ns() - self._clock.monotonic_ns()
 
     def poll(self) -> None:
         """Ask for the vehicle's time when it is due: often until settled, then once a second."""
         now_ns = self._clock.monotonic_ns()
+        self._watch_unix(now_ns)
         every_ns = EVERY_NS if self._timesync.settled else SETTLING_NS
         if self._asked_ns is None or now_ns - self._asked_ns >= every_ns:
             self._asked_ns = now_ns
@@ -82,6 +87,11 @@ class TimeBase:
     @property
     def _breaks(self) -> tuple[int, int]:
         return self._timesync.counts["reboots"], self._timesync.counts["jumps_ahead"]
+
+    def _watch_unix(self, now_ns: int) -> None:
+        before_ns, self._unix_minus_ours_ns = self._unix_minus_ours_ns, self._clock.unix_ns() - now_ns
+        if before_ns is not None and abs(self._unix_minus_ours_ns - before_ns) > STEP_NS:
+            self.on_step((self._unix_minus_ours_ns - before_ns) / NS_PER_S, now_ns)
 
     def _tell(self, before: tuple[int, int]) -> None:
         if self._breaks != before:

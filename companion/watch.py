@@ -47,6 +47,18 @@ class AutopilotWatch:
         """By kind: conditions (how often each began), echoes, foreign setpoints."""
         return dict(self.notices.counts + self._confirmation.counts + self._heard)
 
+    def clock_restarted(self, why: str, now_ns: int) -> None:
+        """The vehicle's clock began anew or jumped, which is how a reboot shows first."""
+        self.notices.happened("clock_restarts", f"{why}: tracks and time base start anew", now_ns)
+
+    def unix_stepped(self, step_s: float, now_ns: int) -> None:
+        """Our own clock was set: the stamps of sensor hosts that were not are off by as much."""
+        self.notices.happened("unix_steps", f"companion's clock stepped by {step_s:+.1f} s", now_ns)
+
+    def origin_moved(self, moved_m: float, now_ns: int) -> None:
+        """The estimator was reset: targets and the arena now lie elsewhere on the ground."""
+        self.notices.happened("origin_resets", f"estimator reset: the origin moved by {moved_m:.1f} m", now_ns)
+
     def heartbeat(self, beat: Heartbeat, now_ns: int) -> None:
         """Whether the autopilot is of the profile's kind."""
         expected = self._profile.autopilot

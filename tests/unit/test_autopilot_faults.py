@@ -343,6 +343,28 @@ def test_a_clock_that_jumps_while_only_timesync_is_heard() -> None:
     assert play(script, peer).counts["timesync.jumps_ahead"] == 1
 
 
+def test_a_step_of_unix_time_is_followed_at_once_and_told() -> None:
+    def frame(world: World, late_s: float = 0.0) -> None:
+        stamp_ns = world.clock.unix_ns() - round(late_s * 1e9)
+        payload = {"stamp_ns": stamp_ns, "clock": "unix", "kind": "detection", "obstacles": []}
+        world.service._inbox.push("camera", json.dumps(payload).encode(), None)
+
+    async def script(world: World) -> None:
+        await flown(world)
+        for k in range(40):
+            if k == 20:
+                world.clock.set_unix(-3600.0)
+            frame(world)
+            await world.run(0.05)
+        assert world.state == "ACTIVE"
+
+    world = play(script, Px4())
+    assert world.counts["obstacles.frames"] == 40
+    assert "obstacles.future" not in world.counts
+    assert "obstacles.stale" not in world.counts
+    assert world.peer.said("companion's clock stepped by -3600.0 s") == 1
+
+
 def test_a_pause_of_the_link_is_no_jump() -> None:
     async def script(world: World) -> None:
         await flown(world)
