@@ -13,6 +13,7 @@ from companion.types import NS_PER_S
 RETRY_NS = 2 * NS_PER_S
 LOST_NS = NS_PER_S  # a stream of 3 Hz or more is lost after this, a slower one after
 LOST_PERIODS = 3
+ALIVE_PERIODS = 2  # a heartbeat this much later than a stream's last message: it is the stream, not the link
 
 
 class StreamRequests:
@@ -35,19 +36,27 @@ class StreamRequests:
         """A message arrived."""
         self._heard_ns[message] = now_ns
 
-    def poll(self, wanted: Mapping[int, float], now_ns: int) -> list[int]:
+    def poll(self, wanted: Mapping[int, float], now_ns: int, heartbeat_ns: int | None) -> set[int]:
         """Ask for what does not arrive of ``wanted`` (id: rate [Hz]), every two seconds.
 
+        Args:
+            heartbeat_ns: the last heartbeat of the autopilot.
         Returns:
-            Those that did arrive and have stopped.
+            Those that have stopped while heartbeats went on.
         """
-        stopped = []
+        stopped = set()
         for message, rate_hz in wanted.items():
             asked_ns, heard_ns = self._asked_ns.get(message), self._heard_ns.get(message)
             lost_ns = max(LOST_NS, round(LOST_PERIODS * NS_PER_S / rate_hz))
             arriving = heard_ns is not None and now_ns - heard_ns <= lost_ns
-            if heard_ns is not None and not arriving:
-                stopped.append(message)
+            alive_ns = ALIVE_PERIODS * NS_PER_S / rate_hz
+            if (
+                heard_ns is not None
+                and not arriving
+                and heartbeat_ns is not None
+                and heartbeat_ns - heard_ns > alive_ns
+            ):
+                stopped.add(message)
             if asked_ns is None or (not arriving and now_ns - asked_ns >= RETRY_NS):
                 self._asked_ns[message] = now_ns
                 self._ask(message, rate_hz)

@@ -321,11 +321,10 @@ class VehicleSession:
             wanted |= {mav.MSG_LOCAL_POSITION_NED: rate_hz, mav.MSG_ATTITUDE_QUATERNION: rate_hz}
         if self._obeyed:
             wanted[mav.MSG_POSITION_TARGET_LOCAL_NED] = ECHO_HZ
-        stopped = {message for message in self._streams.poll(wanted, now_ns) if message in wanted}
-        silent = self._heartbeat_ns is None or now_ns - self._heartbeat_ns > self._timeout_ns
+        stopped = self._streams.poll(wanted, now_ns, self._heartbeat_ns)
         for message in wanted.keys() - {mav.MSG_POSITION_TARGET_LOCAL_NED}:  # that one is `confirm`'s
             name = mav.message_name(message)
-            text = f"{name} stopped, asked for again" if message in stopped and not silent else None
+            text = f"{name} stopped, asked for again" if message in stopped else None
             self.watch.notices.stand(f"lost_{name}", text, now_ns)
 
     def _tell(self) -> None:

@@ -46,6 +46,7 @@ class Peer:
         self.v = np.zeros(3)
         self.target: Any = None  # the setpoint that it follows
         self.target_ms = -(10**9)
+        self.velocities: dict[int, Any] = {}  # by its clock [ms], as it was told
         self.taken: list[tuple[int, int, Any]] = []  # landed state, mode, setpoint as received
         self.requests: list[tuple[int, int]] = []  # modes asked for
         self.asked: list[int] = []  # intervals asked for
@@ -84,6 +85,7 @@ class Peer:
             case "ATTITUDE_QUATERNION":
                 return [self.mav.attitude_quaternion_encode(self.boot_ms, 1.0, 0, 0, 0, 0, 0, 0)]
             case "LOCAL_POSITION_NED":
+                self.velocities[self.boot_ms] = self.v
                 return [self.mav.local_position_ned_encode(self.boot_ms, *self.p, *self.v)]
             case "EXTENDED_SYS_STATE":
                 return [self.mav.extended_sys_state_encode(0, self.landed)]

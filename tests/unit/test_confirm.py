@@ -142,7 +142,7 @@ def test_streams_are_asked_for_until_they_come_and_when_they_stop() -> None:
             streams.heard(32, now_ns)
         if step % 5 == 0 and now_ns < 8 * S:
             streams.heard(245, now_ns)
-        stopped |= {(message, now_ns // MS) for message in streams.poll(wanted, now_ns)}
+        stopped |= {(message, now_ns // MS) for message in streams.poll(wanted, now_ns, now_ns - 50 * MS)}
     assert [(at, hz) for at, message, hz in asked if message == 32] == [
         (0, 50.0),
         (2000, 50.0),
@@ -153,6 +153,15 @@ def test_streams_are_asked_for_until_they_come_and_when_they_stop() -> None:
     assert [at for at, message, _ in asked if message == 245] == [0, 9100, 11100]  # three periods after 7.5 s
     assert min(at for message, at in stopped if message == 32) == 9000
     assert min(at for message, at in stopped if message == 245) == 9100
+
+
+def test_a_link_that_is_gone_is_not_a_stream_that_stopped() -> None:
+    streams = StreamRequests(lambda message, hz: None)
+    streams.heard(32, 10 * S)
+    wanted = {32: 50.0}
+    assert streams.poll(wanted, 12 * S, 10 * S + 30 * MS) == set()
+    assert streams.poll(wanted, 12 * S, None) == set()
+    assert streams.poll(wanted, 12 * S, 10 * S + 50 * MS) == {32}
 
 
 def at(t_ns: int, p: list[float], v: list[float], counter: int | None = None, std: float = 0.0) -> VehicleState:
