@@ -227,6 +227,7 @@ def test_a_lost_link_is_no_flood() -> None:
         assert world.warnings == ()
         assert not any("stopped" in text for text in peer.texts[texts:])
         assert len(peer.texts) - texts <= 3
+        assert not any(name.startswith("autopilot.lost") for name in world.counts)
 
     play(script, peer)
 

@@ -232,6 +232,46 @@ def test_a_takeover_on_ardupilot_is_not_fought() -> None:
     assert peer.requests == [(GUIDED, 0)]
 
 
+@pytest.mark.parametrize(("peer", "hold", "left"), [(Px4(), (4, 3), PX4_HOLD), (ArduCopter(), (BRAKE, 0), BRAKE)])
+def test_a_brain_that_fails_leaves_the_vehicle_in_its_hold_mode(
+    peer: Px4 | ArduCopter, hold: tuple[int, int], left: int
+) -> None:
+    async def script(world: World) -> None:
+        await flown(world)
+        world.session.fail("on purpose", world.clock.monotonic_ns())
+        taken = len(peer.taken)
+        await world.run(1.0)
+        assert world.state == "FAULT"
+        assert (peer.requests[-1], peer.mode) == (hold, left)
+        assert len(peer.taken) == taken
+
+    play(script, peer)
+
+
+def test_ardupilot_on_the_ground_again_is_sent_nothing() -> None:
+    peer = ArduCopter()
+
+    async def script(world: World) -> None:
+        await flown(world)
+        peer.landed = GROUND  # still armed, still in GUIDED
+        await world.run(0.6)
+        taken = len(peer.taken)
+        assert world.state == "READY"
+        await world.run(1.0)
+        assert len(peer.taken) == taken
+
+    play(script, peer)
+
+
+def test_a_configured_system_is_settled_at_its_first_heartbeat() -> None:
+    async def script(world: World) -> None:
+        await world.run(1.0)
+        assert world.state == "READY"
+        assert world.session.config.vehicle.profile == "px4"
+
+    play(script, Px4(system=7), mavlink={"system_id": 7})
+
+
 def test_ardupilot_setpoints_keep_within_its_jerk_limit() -> None:
     peer = ArduCopter()
 
