@@ -44,6 +44,10 @@ class ManualClock:
     def unix_ns(self) -> int:
         return self._monotonic_ns + self._unix_offset_ns
 
+    def set_unix(self, seconds: float) -> None:
+        """Step unix time, as NTP or an operator does; the monotonic clock goes on."""
+        self._unix_offset_ns += int(seconds * 1e9)
+
     async def sleep(self, seconds: float) -> None:
         due = asyncio.Event()
         self._sleepers.append((self._monotonic_ns + int(seconds * 1e9), due))

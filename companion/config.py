@@ -18,7 +18,7 @@ from msgspec import Meta, Struct
 from companion.config_check import check_arena, check_confirmation, check_reserve, check_ros2, check_tick, pointed
 from companion.config_traffic import UNTRUSTED, TrafficConfig, check_traffic
 from companion.errors import ConfigError
-from companion.profiles import PROFILES, Profile
+from companion.profiles import PROFILES, UNDECIDED, Profile
 
 Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]
@@ -40,7 +40,8 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 class VehicleConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     name: Name = "uav1"  # the Zenoh prefix is uav/<name>
-    profile: Literal["crazyflie-sim", "px4", "ardupilot"] = "crazyflie-sim"
+    profile: Literal["crazyflie-sim", "px4", "ardupilot", "auto"] = "crazyflie-sim"  # auto: px4 or ardupilot, as heard
+    setpoint: Literal["acceleration", "velocity+acceleration"] = "acceleration"  # the latter for autopilots that damp
     source: Literal["mavlink", "zenoh"] = "mavlink"
     stale_s: Positive = 0.5  # a vehicle state older than this is no longer fresh
 
@@ -177,7 +178,7 @@ class LimitsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     acceleration_m_s2: Acceleration = 3.0  # each axis, net of gravity
     norm_m_s2: Positive | None = None  # of the whole net acceleration
     tilt_deg: Annotated[float, Meta(gt=0.0, lt=90.0)] | None = 45.0  # of the thrust (PX4: MPC_TILTMAX_AIR)
-    slew_m_s3: Positive | None = None  # each axis, how fast a setpoint may change
+    slew_m_s3: Positive | None = None  # each axis, how fast a setpoint may change; None: the profile's
     speed_m_s: Positive = 6.0
     arena_min: Point = (-10.0, -10.0, 0.3)  # floor is the third component
     arena_max: Point = (10.0, 10.0, 10.0)
@@ -226,7 +227,12 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def profile(self) -> Profile:
-        return PROFILES[self.vehicle.profile]
+        """The vehicle's; a stand-in under which nothing is sent while ``auto`` is open."""
+        return PROFILES.get(self.vehicle.profile, UNDECIDED)
+
+    @property
+    def type_mask(self) -> int:
+        return self.profile.mask(self.vehicle.setpoint)
 
     @property
     def rate_hz(self) -> int:
@@ -241,6 +247,10 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return self.profile.actuation_lag_s if self.delay.actuation_s is None else self.delay.actuation_s
 
     @property
+    def response_lag_s(self) -> float:
+        return self.profile.response_lag_s if self.delay.actuation_s is None else self.delay.actuation_s
+
+    @property
     def reference_limit_m_s2(self) -> float:
         """The acceleration limit of each axis less what the disturbance estimate may add on the wire."""
         reserve = self.disturbance.bound_m_s2 if self.disturbance.enabled else 0.0
@@ -249,6 +259,13 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def prefix(self) -> str:
         return f"uav/{self.vehicle.name}"
+
+    def flown_as(self, profile: str) -> Config:
+        """This configuration for the vehicle ``profile``, whose defaults fill what is not set."""
+        replace, limits = msgspec.structs.replace, self.limits
+        if limits.slew_m_s3 is None:
+            limits = replace(limits, slew_m_s3=PROFILES[profile].slew_m_s3)
+        return replace(self, vehicle=replace(self.vehicle, profile=profile), limits=limits)
 
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
@@ -298,6 +315,8 @@ def parse_config(raw: Mapping[str, Any], *, source: str = "configuration") -> Co
         config = msgspec.convert(merged, Config)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {pointed(str(error))}") from None
+    if config.vehicle.profile != "auto":
+        config = config.flown_as(config.vehicle.profile)
     check_tick(config.rate_hz, source)
     if config.disturbance.enabled:
         check_reserve(config.limits.acceleration_m_s2, config.disturbance.bound_m_s2, source)

@@ -37,6 +37,10 @@ class DisturbanceObserver:
         self._v_last: Vec3 | None = None
         self._frozen = True
 
+    def skip(self) -> None:
+        """The next velocity does not follow from the last one (an estimator reset): it says nothing about forces."""
+        self._v_last = None
+
     def update(self, v_enu: Vec3, elapsed_s: float | None, *, adapt: bool) -> Vec3:
         """The estimate [m/s^2] after this tick's velocity; unchanged unless ``adapt`` and the last command was free."""
         v_last, self._v_last = self._v_last, v_enu

@@ -110,7 +110,8 @@ class Doors:
         self._on_vehicle(vehicle)
 
     def _config_json(self) -> bytes:
-        return msgspec.json.encode({"hash": config_hash(self._config), "config": msgspec.to_builtins(self._config)})
+        config = self._session.config  # with the profile that `auto` came to
+        return msgspec.json.encode({"hash": config_hash(config), "config": msgspec.to_builtins(config)})
 
     def _health_json(self) -> bytes:
         situation = self._session.situation

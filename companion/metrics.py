@@ -15,12 +15,16 @@ class TickMeter:
     """Latency of whole ticks (state received to setpoint sent), verdict counts, deadline misses."""
 
     def __init__(self, period_s: float) -> None:
-        self._period_ms = 1e3 * period_s
+        self.set_period(period_s)
         self.ticks = 0
         self._latencies_ms: deque[float] = deque(maxlen=WINDOW)
         self.verdicts: Counter[str] = Counter()
         self.deadline_misses = 0  # ticks whose work outlasted the period, and states skipped
         self.states_skipped = 0  # overtaken in the mailbox by a newer one
+
+    def set_period(self, period_s: float) -> None:
+        """The tick's deadline from now on."""
+        self._period_ms = 1e3 * period_s
 
     def skip(self) -> None:
         """A vehicle state was overtaken by a newer one before it was answered: its deadline was missed."""

@@ -89,6 +89,10 @@ class Microservices:
             CMD_PREFLIGHT_STORAGE: self._storage,
         }
 
+    def adopt(self, profile: str) -> None:
+        """`vehicle.profile = "auto"` is settled."""
+        self._live.adopt(profile)
+
     def handle(self, request: ParamRequest) -> None:
         """One message of the parameter protocol."""
         self._params.handle(request)

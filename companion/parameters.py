@@ -95,6 +95,10 @@ class LiveParameters:
         self._apply = apply
         self._announce = announce
 
+    def adopt(self, profile: str) -> None:
+        """The vehicle's profile is settled: its defaults hold from here on."""
+        self._base, self.config = self._base.flown_as(profile), self.config.flown_as(profile)
+
     def read(self, name: str) -> float:
         return BY_NAME[name].of(self.config)
 

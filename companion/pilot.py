@@ -16,6 +16,7 @@ import numpy as np
 from companion.config import Config
 from companion.disturbance import DisturbanceObserver
 from companion.errors import BrainFailure, ConfigError, PolicyOutputInvalid
+from companion.origin import OriginWatch
 from companion.policy import Policy, brake, hold, load_policy
 from companion.safety.filter import FilterInput, SafetyFilter
 from companion.tracking.tracker import Tracker
@@ -77,6 +78,8 @@ class PilotOutput:
     prediction: Prediction
     policy_valid: bool
     obstacle_frames: int
+    v_next: Vec3  # velocity one tick after this setpoint acts, under u_safe: goes with it where the mask uses velocity
+    origin_moved_m: float | None = None  # the estimator was reset with this tick's state
 
 
 class Pilot:
@@ -95,7 +98,8 @@ class Pilot:
         self._policy = load_policy(config.policy, config.limits) if policy is None else policy
         self._tracker = Tracker(config.tracking, config.safety.drone_radius_m)
         self._filter = SafetyFilter(config.safety, config.limits)
-        self._observer = DisturbanceObserver(config.disturbance, lag_s=config.actuation_s)
+        self._observer = DisturbanceObserver(config.disturbance, lag_s=config.response_lag_s)
+        self._origin = OriginWatch()
         self._delay_ns = round((config.delay.loop_s + config.actuation_s) * NS_PER_S)
         self._history_len = 2 + math.ceil(self._delay_ns * config.rate_hz / NS_PER_S)
         self.reset()
@@ -105,11 +109,16 @@ class Pilot:
         self._tracker.reset()
         self._filter.reset()
         self._observer.reset()
+        self._origin.reset()
         self._commands: deque[tuple[int, Vec3]] = deque(maxlen=self._history_len)  # (acts from [ns], net a)
         self._last_ns: int | None = None
         self._ahead: tuple[int, Prediction] | None = None  # what `observe` has prepared
         self._anchor: Vec3 | None = None
         self._task: Task | None = None
+
+    def configured(self, config: Config) -> Pilot:
+        """A new pilot with the same policy, for a profile that was not known before."""
+        return Pilot(config, self._policy)
 
     def retune(self, config: Config) -> None:
         """Fly on under ``config`` from the next step: other margins and limits, the same tracks and state.
@@ -152,6 +161,7 @@ class Pilot:
         """
         vehicle = inputs.vehicle
         elapsed_s = self._elapsed(vehicle)
+        moved_m = self._moved(vehicle)
         ahead, self._ahead = self._ahead, None
         prepared = ahead is not None and ahead[0] == vehicle.stamp_ns
         prediction = ahead[1] if ahead and prepared else self._track(inputs.frames, vehicle.stamp_ns)
@@ -175,6 +185,8 @@ class Pilot:
             prediction=prediction,
             policy_valid=valid,
             obstacle_frames=len(inputs.frames),
+            v_next=frozen(v_act + result.a_safe / self._config.rate_hz),
+            origin_moved_m=moved_m,
         )
 
     def filter_acceleration(
@@ -182,6 +194,7 @@ class Pilot:
     ) -> FilterResult:
         """Filter a reference of your own (net, ENU [m/s^2]) instead of the policy's: the library's front door."""
         elapsed_s = self._elapsed(vehicle)
+        self._moved(vehicle)
         prediction = self._track(frames, vehicle.stamp_ns)
         self._tracker.note_vehicle(vehicle)
         p_act, v_act = self._at_action(vehicle)
@@ -204,6 +217,25 @@ class Pilot:
         if vehicle.stamp_ns <= last:
             raise BrainFailure(f"vehicle state: expected a stamp after {last} ns, got {vehicle.stamp_ns} ns")
         return (vehicle.stamp_ns - last) / NS_PER_S
+
+    def _moved(self, vehicle: VehicleState) -> float | None:
+        """Notice a reset of the estimator and forget what was relative to the old origin.
+
+        That is the anchor, the filter's detour and decays, the own path, and the velocity that the disturbance
+        observer compares with. What was commanded stays: accelerations do not depend on the origin, they are still
+        under way, and slew counts from the last. So does the disturbance estimate. Tracks stay as well. Those of
+        sources fixed to the ground are as good as before; those of sensors on board lie in the old frame until their
+        next frame, which restarts what is named and starts the rest anew beside ghosts that end after
+        `tracking.coast_s`. A ghost can only add margin, while to drop all would be to fly blind until each obstacle
+        is confirmed again.
+        """
+        moved_m = self._origin.moved_m(vehicle)
+        if moved_m is not None:
+            self._tracker.forget_path()
+            self._filter.reset()
+            self._observer.skip()
+            self._anchor = None
+        return moved_m
 
     def _at_action(self, vehicle: VehicleState) -> tuple[Vec3, Vec3]:
         """Position and velocity at the instant at which this tick's setpoint acts.

@@ -42,6 +42,11 @@ class Publisher:
     def log_hash(self) -> str:
         return self._hash.hexdigest()
 
+    def configured(self, config: Config) -> None:
+        """The profile is settled: the log says with which configuration it is flown."""
+        if self._recorder is not None:
+            self._recorder.config(config, 0)
+
     def tick(
         self,
         record: wire.SetpointRecord,
@@ -104,7 +109,7 @@ class Publisher:
         """The status, at 5 Hz and whenever the situation or the target changed."""
         situation = session.situation
         target = None if target_enu is None else tuple(target_enu.tolist())
-        key = (situation, target)
+        key = (situation, target, session.watch.notices.standing)
         changed = self._last is None or self._last[1] != key
         if not changed and self._last is not None and now_ns - self._last[0] < STATUS_NS:
             return
@@ -118,6 +123,8 @@ class Publisher:
             engaged=situation.engaged,
             armed=session.armed,
             airborne=situation.airborne,
+            profile=session.config.vehicle.profile,
+            warnings=list(session.watch.notices.standing),
             target=target,
             tracks=self._tracks,
             agile=self._agile,

@@ -51,6 +51,7 @@ def vehicle_out(vehicle: VehicleState) -> VehicleOut:
         position=_vec(vehicle.p_enu),
         velocity=_vec(vehicle.v_enu),
         attitude=(w, x, y, z),
+        reset_counter=vehicle.reset_counter,
     )
 
 
@@ -111,6 +112,8 @@ class FlightHash:
         add = self._sha.update
         add(struct.pack("<q", vehicle.stamp_ns) + state.value.encode())
         add(vehicle.p_enu.tobytes() + vehicle.v_enu.tobytes() + vehicle.q_enu_from_flu.tobytes())
+        if vehicle.reset_counter is not None:
+            add(struct.pack("<q", vehicle.reset_counter))
         for frame in frames:
             add(struct.pack("<q", frame.stamp_ns) + frame.source.encode())
             for seen in frame.detections:

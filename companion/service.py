@@ -15,7 +15,7 @@ from pathlib import Path
 from companion.clock import Clock, stopwatch_ns
 from companion.config import Config
 from companion.doors import Doors
-from companion.errors import CompanionError, LockstepStalled
+from companion.errors import CompanionError
 from companion.link import mav
 from companion.link.events import Event, TimesyncReply, TimesyncRequest
 from companion.link.inbox import ObstacleInbox
@@ -26,6 +26,7 @@ from companion.link.signing_files import open_signing
 from companion.link.traffic import TrafficDoors
 from companion.link.traffic_events import TrafficEvent
 from companion.link.zenoh import ZenohLink
+from companion.lockstep import LockstepBarrier
 from companion.metrics import Summary, TickMeter
 from companion.microservices import Microservices
 from companion.parameters import with_stored
@@ -43,8 +44,6 @@ from companion.types import NS_PER_S, VehicleState
 log = logging.getLogger("companion")
 
 HEARTBEAT_NS = NS_PER_S
-GONE_NS = 5 * NS_PER_S  # lockstep: not even a heartbeat of the simulator
-STALL_NS = NS_PER_S  # lockstep: no progress for this much wall time ends the run
 WAKE_S = 0.2  # of wall time: heartbeats, timeouts and the stall guard need no telemetry
 RELEASE_NS = 6 * NS_PER_S // 10  # on shutdown in flight the autopilot is given this long to show its hold mode
 
@@ -60,7 +59,7 @@ class Service:
         signing = open_signing(config.mavlink.signing, clock.unix_ns, log.warning)
         self._codec = MavlinkCodec(system=config.mavlink.system_id or 1, signing=signing)
         self._route = Route(config.target, config.limits)
-        self._session = VehicleSession(config, self._codec, self._route.set_position)
+        self._session = VehicleSession(config, self._codec, self._route.set_position, self._on_profile)
         self._transport = Router(config.mavlink, self._codec, self._session, clock, self._on_events)
         self._inbox = ObstacleInbox(
             queue=config.obstacles.queue,
@@ -75,8 +74,10 @@ class Service:
             self._session.request_message,
             elapsed_ns=None if self._lockstep else clock.monotonic_ns,
         )
+        self._barrier = LockstepBarrier(config, self._inbox, clock)
         self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
-        self._time = TimeBase(clock, self._codec, self._transport.send, self._on_reboot)
+        self._time = TimeBase(clock, self._codec, self._transport.send, self._on_restart, runs=not self._lockstep)
+        self._time.on_step = self._session.watch.unix_stepped
         self._meter = TickMeter(1.0 / config.rate_hz)
         self._publisher: Publisher
         self._doors = Doors(
@@ -96,7 +97,6 @@ class Service:
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
         self._arrived_ns = 0  # its arrival, for the latency figure
-        self._pending_since_ns = 0
         self._vehicle_ns = 0  # vehicle time of the newest state
         self._log_failed = False
         self._last_beat: tuple[int, int] | None = None
@@ -166,12 +166,12 @@ class Service:
             self._wake.clear()
             if self._stopping and deadline_ns is None:
                 deadline_ns = self._begin_shutdown()
-            if self._pending is not None and self._inputs_complete(self._pending):
+            if self._pending is not None and self._barrier.passes(self._pending.stamp_ns):
                 vehicle, self._pending = self._pending, None
                 self._tick(vehicle)
             elif self._pending is None and self._lockstep:
                 self._thinker.observe_ahead(self._vehicle_ns, self._now_ns())
-                self._check_simulator()
+                self._barrier.check_simulator(self._vehicle_ns)
             self._housekeeping()
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
@@ -186,24 +186,6 @@ class Service:
             self._flush()
         return self._clock.monotonic_ns() + RELEASE_NS
 
-    def _inputs_complete(self, vehicle: VehicleState) -> bool:
-        """In lockstep: whether every source's marker and frames for this tick are there."""
-        sources = self._config.lockstep_sources
-        if not self._lockstep or self._inbox.ready(vehicle.stamp_ns, sources):
-            return True
-        if self._clock.monotonic_ns() - self._pending_since_ns > STALL_NS:
-            missing = self._inbox.missing(vehicle.stamp_ns, sources)
-            raise LockstepStalled(f"lockstep: no progress for 1 s at tick {vehicle.stamp_ns}: missing {missing}")
-        return False
-
-    def _check_simulator(self) -> None:
-        """In lockstep: a simulator that holds time still sends heartbeats; one that is gone sends nothing."""
-        heard_ns = self._transport.heard_ns
-        if heard_ns is not None and self._clock.monotonic_ns() - heard_ns > GONE_NS:
-            raise LockstepStalled(
-                f"lockstep: nothing from the vehicle for {GONE_NS / 1e9:g} s after {self._vehicle_ns} ns"
-            )
-
     def _tick(self, vehicle: VehicleState) -> None:
         """One vehicle state in, one record out, and a setpoint where the state of the daemon sends one."""
         started_ns, now_ns, session = stopwatch_ns(), self._now_ns(), self._session
@@ -217,6 +199,7 @@ class Service:
         if output is not None and session.streams:
             with self._thinker.fault_on_error(now_ns):
                 self._send_setpoint(vehicle, output)
+                session.sent_setpoint(output.wire, now_ns)
                 sent = True
         messages = self._flush()
         sent_ns = stopwatch_ns()
@@ -234,11 +217,9 @@ class Service:
         self._meter.tick(timings_ms["total"], busy_ms, record.verdict)
 
     def _send_setpoint(self, vehicle: VehicleState, output: PilotOutput) -> None:
-        self._transport.send(
-            self._codec.encode_setpoint(
-                vehicle.stamp_ns // 1_000_000, output.wire, self._config.profile.type_mask, v_enu=vehicle.v_enu
-            )
-        )
+        """Acceleration, and where the mask uses it the velocity that the vehicle should then have."""
+        stamp_ms, mask = vehicle.stamp_ns // 1_000_000, self._config.type_mask
+        self._transport.send(self._codec.encode_setpoint(stamp_ms, output.wire, mask, v_enu=output.v_next))
 
     # housekeeping
 
@@ -291,6 +272,7 @@ class Service:
         """Everything counted, by kind."""
         groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
         groups |= {"mavlink": self._codec.counts, "texts": self._session.text_counts}
+        groups |= {"autopilot": self._session.watch.counts, "timesync": self._time.counts}
         return self._meter.counts(groups) | self._transport.all_counts()
 
     def _summary(self, recorder: Recorder | None) -> Summary:
@@ -301,6 +283,7 @@ class Service:
     # what the links hand in
 
     def _on_events(self, events: list[Event]) -> None:
+        self._barrier.heard()
         for event in events:
             if isinstance(event, TimesyncRequest | TimesyncReply):
                 self._time.handle(event, self._session.system)
@@ -314,8 +297,7 @@ class Service:
 
     def _on_vehicle(self, vehicle: VehicleState) -> None:
         """A new vehicle state; only the newest waits for the control task."""
-        if self._time.rebooted(vehicle.stamp_ns):
-            self._on_reboot()
+        self._time.note(vehicle.stamp_ns)
         if self._is_stale(vehicle.stamp_ns):
             self._meter.skip()
             return
@@ -326,7 +308,7 @@ class Service:
         self._pending = vehicle
         self._vehicle_ns = vehicle.stamp_ns
         self._arrived_ns = stopwatch_ns()
-        self._pending_since_ns = self._clock.monotonic_ns()
+        self._barrier.pending()
         self._traffic.on_vehicle(vehicle)
         self._session.heard_vehicle(self._now_ns())
         self._wake.set()
@@ -336,13 +318,23 @@ class Service:
         age_ns = None if self._lockstep else self._time.age_ns(stamp_ns)
         return age_ns is not None and age_ns > self._config.vehicle.stale_s * NS_PER_S
 
-    def _on_reboot(self) -> None:
-        log.warning("the autopilot rebooted: tracks, queues and clock offset start anew")
+    def _on_profile(self, config: Config) -> None:
+        """`vehicle.profile = "auto"` is settled; nothing was sent before."""
+        log.info("profile %s", config.vehicle.profile)
+        self._config = config
+        self._thinker.adopt(config)
+        self._services.adopt(config.vehicle.profile)
+        self._publisher.configured(config)
+        self._meter.set_period(1.0 / config.rate_hz)
+
+    def _on_restart(self, why: str) -> None:
+        log.warning("%s: tracks, queues and clock offset start anew", why)
         self._pending = None
         self._vehicle_ns = 0
         self._thinker.reset()
         self._traffic.reset()
         self._session.rebooted()
+        self._session.watch.clock_restarted(why, self._now_ns())
 
     def _retune(self, config: Config) -> None:
         """Other live parameters, between two ticks: all of them or, with ConfigError, none."""

@@ -43,6 +43,11 @@ class Thinker:
         self._session = session
         self.reset()
 
+    def adopt(self, config: Config) -> None:
+        """The profile is known: the pilot needs its delays, rate and limits."""
+        self._config = config
+        self._pilot = self._pilot.configured(config)
+
     def reset(self) -> None:
         """The vehicle's clock began anew: forget tracks, queues and everything that was dated."""
         self._pilot.reset()
@@ -98,6 +103,8 @@ class Thinker:
         with self.fault_on_error(now_ns):
             output = self._pilot.step(inputs, sent=self._session.streams and situation.external)
             self._policy_valid = output.policy_valid
+            if output.origin_moved_m is not None:
+                self._session.watch.origin_moved(output.origin_moved_m, now_ns)
         return output
 
     @contextlib.contextmanager

@@ -49,6 +49,7 @@ class VehicleState:
     v_enu: Vec3  # [m/s]
     q_enu_from_flu: FloatArray = field(default_factory=lambda: frozen([1.0, 0.0, 0.0, 0.0]))
     p_std_m: float = 0.0  # 1 sigma of each position axis, 0 where unknown
+    reset_counter: int | None = None  # of the estimator (ODOMETRY): another value means another origin
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from companion.link.events import (
     LandedState,
     Position,
     SetpointEcho,
+    SetpointHeard,
     StatusText,
     SystemTime,
     TimesyncReply,
@@ -134,13 +135,19 @@ def system_time(m: Any) -> list[Event]:
 
 
 def position_target_local_ned(m: Any) -> list[Event]:
-    """Only the fields that the mask uses are kept: autopilots fill the others with NaN."""
+    """Only what the mask uses is kept: autopilots fill the rest with NaN, and older PX4 without saying so."""
+    values = (m.x, m.y, m.z, m.vx, m.vy, m.vz, m.afx, m.afy, m.afz)
+    mask = m.type_mask | sum(1 << bit for bit, value in enumerate(values) if not math.isfinite(value))
     a_enu = v_enu = frozen([0.0, 0.0, 0.0])
-    if not m.type_mask & mav.IGNORE_ACCELERATION:
+    if not mask & mav.IGNORE_ACCELERATION:
         a_enu = _enu((m.afx, m.afy, m.afz), MAX_SPEED_M_S)
-    if not m.type_mask & mav.IGNORE_VELOCITY:
+    if not mask & mav.IGNORE_VELOCITY:
         v_enu = _enu((m.vx, m.vy, m.vz), MAX_SPEED_M_S)
-    return [SetpointEcho(*_sender(m), m.time_boot_ms * _MS, m.type_mask, m.coordinate_frame, a_enu, v_enu)]
+    return [SetpointEcho(*_sender(m), m.time_boot_ms * _MS, mask, m.coordinate_frame, a_enu, v_enu)]
+
+
+def setpoint_heard(m: Any) -> list[Event]:
+    return [SetpointHeard(*_sender(m), m.get_msgId(), m.target_system, m.target_component)]
 
 
 def command(m: Any) -> Command:
@@ -192,6 +199,9 @@ DECODERS: dict[int, Callable[[Any], list[Event]]] = {
     mav.MSG_TIMESYNC: timesync,
     mav.MSG_SYSTEM_TIME: system_time,
     mav.MSG_POSITION_TARGET_LOCAL_NED: position_target_local_ned,
+    mav.MSG_SET_ATTITUDE_TARGET: setpoint_heard,
+    mav.MSG_SET_POSITION_TARGET_LOCAL_NED: setpoint_heard,
+    mav.MSG_SET_POSITION_TARGET_GLOBAL_INT: setpoint_heard,
 }
 
 

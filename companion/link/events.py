@@ -123,7 +123,10 @@ class SystemTime:
 
 @dataclass(frozen=True, slots=True)
 class SetpointEcho:
-    """POSITION_TARGET_LOCAL_NED: what the autopilot says it follows."""
+    """POSITION_TARGET_LOCAL_NED: what the autopilot says it follows.
+
+    ``type_mask`` also ignores the fields that are not finite: not every autopilot marks them.
+    """
 
     system: int
     component: int
@@ -132,6 +135,17 @@ class SetpointEcho:
     frame: int
     a_enu: Vec3  # [m/s^2]
     v_enu: Vec3  # [m/s]
+
+
+@dataclass(frozen=True, slots=True)
+class SetpointHeard:
+    """A setpoint that another component sends to an autopilot: SET_POSITION_TARGET_* or SET_ATTITUDE_TARGET."""
+
+    system: int
+    component: int
+    message: int  # its id
+    target_system: int  # 0: any
+    target_component: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +169,7 @@ Event: TypeAlias = (
     | TimesyncReply
     | SystemTime
     | SetpointEcho
+    | SetpointHeard
     | StatusText
     | ParamRequest
     | TrafficEvent

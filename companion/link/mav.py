@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
 COMPONENT = 196  # MAV_COMP_ID_OBSTACLE_AVOIDANCE: this daemon
 AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 TYPE_ONBOARD_CONTROLLER = 18
@@ -24,7 +26,10 @@ MSG_GPS_GLOBAL_ORIGIN = 49
 MSG_COMMAND_INT = 75
 MSG_COMMAND_LONG = 76
 MSG_COMMAND_ACK = 77
+MSG_SET_ATTITUDE_TARGET = 82
+MSG_SET_POSITION_TARGET_LOCAL_NED = 84
 MSG_POSITION_TARGET_LOCAL_NED = 85
+MSG_SET_POSITION_TARGET_GLOBAL_INT = 86
 MSG_TIMESYNC = 111
 MSG_EXTENDED_SYS_STATE = 245
 MSG_ADSB_VEHICLE = 246
@@ -68,4 +73,27 @@ LANDED_LANDING = 4
 IGNORE_POSITION = 0x0007
 IGNORE_VELOCITY = 0x0038
 IGNORE_ACCELERATION = 0x01C0
+IGNORE_YAW = 0x0400
+IGNORE_YAW_RATE = 0x0800
 FORCE = 0x0200
+
+
+def autopilot_name(autopilot: int) -> str:
+    """A MAV_AUTOPILOT in words.
+
+    >>> autopilot_name(12), autopilot_name(200)
+    ('PX4', 'autopilot 200')
+    """
+    if autopilot == 3:
+        return "ArduPilot"  # the dialect still calls it ARDUPILOTMEGA
+    entry = dialect.enums["MAV_AUTOPILOT"].get(autopilot)
+    return f"autopilot {autopilot}" if entry is None else str(entry.name).removeprefix("MAV_AUTOPILOT_")
+
+
+def message_name(message: int) -> str:
+    """The name of a message of the dialect.
+
+    >>> message_name(32)
+    'LOCAL_POSITION_NED'
+    """
+    return str(dialect.mavlink_map[message].msgname)

@@ -18,6 +18,8 @@ WINDOW = 16
 SETTLED_SAMPLES = 5
 JUMP_NS = 20_000_000  # beyond this and what the round trips explain, a sample contradicts the estimate
 CONTRADICTIONS = 3  # in a row: a clock has jumped, start again
+BACK_NS = 1_000_000_000  # a stamp this far behind the newest: the vehicle's clock began anew
+AHEAD_NS = 3_000_000_000  # a stamp this much further ahead than the time that has passed: its clock jumped
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +32,7 @@ class TimeSync:
     """The offset of the clocks, from replies to our own requests only.
 
     ``counts``: accepted, foreign (no open request of ours, or answered before), slow (round trip above 100 ms),
-    contradicting, reboots, jumps.
+    contradicting, reboots, jumps (both clocks go on, but not as before), jumps_ahead (of the vehicle's stamps).
 
     >>> sync = TimeSync()
     >>> for k in range(1, 6):
@@ -46,6 +48,7 @@ class TimeSync:
         self._last_request_ns = 0
         self._unix_minus_ours_ns = 0
         self._last_vehicle_ns: int | None = None
+        self._noted_ns: int | None = None  # our time at that stamp
         self.restart()
 
     def restart(self) -> None:
@@ -53,6 +56,7 @@ class TimeSync:
         self._samples: deque[_Sample] = deque(maxlen=WINDOW)
         self._contradictions = 0
         self._last_vehicle_ns = None
+        self._noted_ns = None
 
     @property
     def settled(self) -> bool:
@@ -102,7 +106,8 @@ class TimeSync:
         if not 0 <= round_trip_ns <= MAX_ROUND_TRIP_NS or tc1_ns <= 0:
             self.counts["slow"] += 1
             return False
-        self.vehicle_time(tc1_ns)
+        if self._last_vehicle_ns is not None and tc1_ns < self._last_vehicle_ns - BACK_NS:
+            self.vehicle_time(tc1_ns, now_ns)
         sample = _Sample(round_trip_ns, (ts1_ns + now_ns) // 2 - tc1_ns)
         if self._contradicts(sample):
             self.counts["contradicting"] += 1
@@ -110,28 +115,42 @@ class TimeSync:
             if self._contradictions < CONTRADICTIONS:
                 return False
             self.counts["jumps"] += 1
+            self.counts["jumps_ahead"] += self._best.ours_minus_vehicle_ns - sample.ours_minus_vehicle_ns > AHEAD_NS
             self.restart()
-            self.vehicle_time(tc1_ns)
+        self._note(tc1_ns, now_ns)
         self._contradictions = 0
         self._samples.append(sample)
         self._unix_minus_ours_ns = unix_ns - now_ns
         self.counts["accepted"] += 1
         return True
 
-    def vehicle_time(self, stamp_ns: int) -> bool:
-        """Note any stamp of the vehicle's clock; one second back means a reboot, which restarts the estimate.
+    def vehicle_time(self, stamp_ns: int, now_ns: int | None = None) -> bool:
+        """Note any stamp of the vehicle's clock; where it does not go on from the last, the estimate restarts.
 
+        One second back means a reboot. Three seconds further ahead than our clock went on meanwhile means that the
+        vehicle's jumped (or that ours stood still); what was dated before is worth nothing then either.
+
+        Args:
+            now_ns: our monotonic clock; None where it does not run beside the vehicle's (lockstep): only a step back
+                is noticed.
         Returns:
-            True on a reboot.
+            True where the vehicle's clock began anew or jumped.
         """
-        last_ns = self._last_vehicle_ns
-        rebooted = last_ns is not None and stamp_ns < last_ns - 1_000_000_000
-        if rebooted:
+        last_ns, noted_ns = self._last_vehicle_ns, self._noted_ns
+        broken = last_ns is not None and stamp_ns < last_ns - BACK_NS
+        if broken:
             self.counts["reboots"] += 1
+        elif last_ns is not None and noted_ns is not None and now_ns is not None:
+            broken = stamp_ns - last_ns > now_ns - noted_ns + AHEAD_NS
+            self.counts["jumps_ahead"] += broken
+        if broken:
             self.restart()
+        self._note(stamp_ns, now_ns)
+        return broken
+
+    def _note(self, stamp_ns: int, now_ns: int | None) -> None:
         if self._last_vehicle_ns is None or stamp_ns > self._last_vehicle_ns:
-            self._last_vehicle_ns = stamp_ns
-        return rebooted
+            self._last_vehicle_ns, self._noted_ns = stamp_ns, now_ns
 
     @property
     def _best(self) -> _Sample:

@@ -126,6 +126,7 @@ class VehicleOut(Struct, frozen=True, kw_only=True):
     position: Vec
     velocity: Vec
     attitude: tuple[float, float, float, float]
+    reset_counter: int | None = None  # of the estimator, where the autopilot tells
 
 
 class TrackOut(Struct, frozen=True, kw_only=True):
@@ -159,6 +160,8 @@ class Status(Struct, frozen=True, kw_only=True):
     engaged: bool
     armed: bool
     airborne: bool
+    profile: str  # of the vehicle, "auto" while that is open
+    warnings: list[str]  # what stands without changing the state: setpoints not followed, a second sender, lost streams
     target: Vec | None
     tracks: int
     agile: list[str]  # tracks that break their assumed agility: their predictions are widened at least twofold

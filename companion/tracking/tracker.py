@@ -60,6 +60,10 @@ class Tracker:
         """From the next update on the vehicle is this large; all tracks stay."""
         self._rules = replace(self._rules, vehicle_radius_m=vehicle_radius_m)
 
+    def forget_path(self) -> None:
+        """The vehicle's local frame moved: where it was does not tell any more which detections are its own."""
+        self._path.reset()
+
     def __len__(self) -> int:
         return int(self._visible().sum())
 

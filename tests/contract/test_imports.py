@@ -18,12 +18,27 @@ LAYERS = [
     {"companion.frames", "companion.profiles", "companion.clock"},
     {"companion.config", "companion.config_check", "companion.config_traffic"},
     {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload"},
-    {"companion.tracking", "companion.safety", "companion.policy", "companion.torch_backend", "companion.disturbance"},
+    {
+        "companion.tracking",
+        "companion.safety",
+        "companion.policy",
+        "companion.torch_backend",
+        "companion.disturbance",
+        "companion.origin",
+    },
     {"companion.pilot"},
     {"companion.state"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
     {
+        "companion.notices",
+        "companion.confirm",
+        "companion.requests",
+        "companion.modes",
+        "companion.watch",
+    },
+    {
         "companion.latch",
+        "companion.lockstep",
         "companion.microservices",
         "companion.parameters",
         "companion.session",
@@ -44,6 +59,7 @@ BRAIN = (
     "companion/disturbance.py",
     "companion/threats.py",
     "companion/tunables.py",
+    "companion/origin.py",
 )
 NOT_IN_BRAIN = {"asyncio", "socket", "time", "random", "os", "logging", "threading", "datetime"}
 HEAVY = {"torch", "pybullet", "matplotlib", "filterpy", "mavsdk", "stable_baselines3", "gymnasium"}

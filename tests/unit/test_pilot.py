@@ -277,3 +277,55 @@ def test_observing_ahead_recognises_the_vehicle_to_the_same_bit() -> None:
         assert ahead.step(inputs).wire.tobytes() == expected.wire.tobytes()
         assert ahead.tracks().covariance.tobytes() == plain.tracks().covariance.tobytes()
     assert ahead.tracking_counts == plain.tracking_counts == {"own_vehicle": 39}
+
+
+def reset_at(k: int, p: list[float], v: list[float], counter: int) -> VehicleState:
+    return VehicleState(k * TICK_NS, frozen(p), frozen(v), reset_counter=counter)
+
+
+def test_an_estimator_reset_forgets_the_origin_and_keeps_what_does_not_depend_on_it() -> None:
+    brain = pilot(Straight([0.0, 0.0, 0.0]), disturbance={"enabled": True}, delay={"actuation_s": 0.1})
+    x, v = 0.0, 0.0
+    for k in range(60):  # a push of 0.2 m/s^2 that nobody commanded, and a ball
+        output = brain.step(PilotInput(reset_at(k, [x, 0, 2], [v, 0, 0], 1), (ball(k, [0, 6, 2]),)))
+        assert output.origin_moved_m is None
+        v += (output.wire[0] + 0.2) * 0.05
+        x += v * 0.05
+    estimate, anchor = output.disturbance, brain._anchor
+    commands = list(brain._commands)
+    assert estimate[0] > 0.05
+    after = brain.step(PilotInput(reset_at(60, [x + 7.0, -3.0, 2], [v - 2.0, 0, 0], 2), (ball(60, [0, 6, 2]),)))
+    assert after.origin_moved_m == pytest.approx(np.hypot(7.0, 3.0), abs=0.2)
+    np.testing.assert_array_equal(after.disturbance, estimate)  # the leap of the velocity is no force
+    assert list(brain._commands)[:-1] == commands[-(len(brain._commands) - 1) :]  # they are still under way
+    assert len(brain.tracks()) == 1
+    assert anchor is not None
+    assert brain._anchor is not None
+    np.testing.assert_allclose(brain._anchor, [x + 7.0, -3.0, 2])
+    assert brain.step(PilotInput(reset_at(61, [x + 7.0, -3.0, 2], [v - 2.0, 0, 0], 2))).origin_moved_m is None
+
+
+def test_a_leap_of_the_position_counts_where_the_autopilot_counts_nothing() -> None:
+    brain = pilot(Straight([0.0, 0.0, 0.0]))
+    brain.step(PilotInput(vehicle(0, [0, 0, 2])))
+    assert brain.step(PilotInput(vehicle(1, [0.9, 0, 2]))).origin_moved_m is None
+    assert brain.step(PilotInput(vehicle(2, [2.0, 0, 2]))).origin_moved_m == pytest.approx(1.1)
+
+
+def test_the_velocity_that_goes_with_a_setpoint_is_that_of_a_tick_later() -> None:
+    brain = pilot(Straight([1.0, 0.0, 0.0]), delay={"actuation_s": 0.1})
+    brain.step(PilotInput(vehicle(0, [0, 0, 2], [2, 0, 0])))
+    brain.step(PilotInput(vehicle(1, [0.1, 0, 2], [2, 0, 0])))
+    output = brain.step(PilotInput(vehicle(2, [0.2, 0, 2], [2, 0, 0])))
+    # 1 m/s^2 over the two ticks until it acts, and over the one that it holds
+    np.testing.assert_allclose(output.v_next, [2.15, 0, 0], atol=1e-12)
+
+
+def test_a_pilot_configured_anew_flies_as_one_made_so() -> None:
+    late = parse_config({"vehicle": {"profile": "ardupilot"}, "disturbance": {"enabled": False}})
+    early = Pilot(parse_config({"vehicle": {"profile": "auto"}}), Straight([2.0, 0.0, 0.0]))
+    fly(early, 5)
+    made = Pilot(late, Straight([2.0, 0.0, 0.0]))
+    for one, other in zip(fly(early.configured(late), 20), fly(made, 20), strict=True):
+        np.testing.assert_array_equal(one.wire, other.wire)
+        assert one.prediction.start_ns == other.prediction.start_ns

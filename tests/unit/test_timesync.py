@@ -134,3 +134,36 @@ def test_drift_is_followed_as_the_window_moves_on() -> None:
         drift_ns = 50_000 * second  # 50 ppm
         assert exchange(sync, OFFSET_NS + (10 + second) * S, offset_ns=OFFSET_NS + drift_ns)
     assert abs(sync.ours_minus_vehicle_ns - (OFFSET_NS + 50_000 * 59)) <= 16 * 50_000
+
+
+def test_a_stamp_further_ahead_than_time_has_passed_restarts(settled: TimeSync) -> None:
+    """Both clocks count: a pause of the link moves both, a jump only the vehicle's."""
+    now_ns = OFFSET_NS + 15 * S
+    assert not settled.vehicle_time(15 * S, now_ns)
+    assert not settled.vehicle_time(75 * S, now_ns + 60 * S)  # a minute of silence
+    assert not settled.vehicle_time(78 * S, now_ns + 60 * S)  # a burst after a stall
+    assert settled.settled
+    assert settled.vehicle_time(81 * S + 1, now_ns + 60 * S)
+    assert not settled.settled
+    assert settled.counts["jumps_ahead"] == 1
+    assert not settled.vehicle_time(81 * S + 20 * MS, now_ns + 60 * S + 20 * MS)
+
+
+def test_without_a_clock_beside_it_only_steps_back_are_noticed(settled: TimeSync) -> None:
+    assert not settled.vehicle_time(500 * S)
+    assert not settled.vehicle_time(5000 * S)
+    assert settled.vehicle_time(4998 * S)
+
+
+def test_a_stray_reply_from_the_future_is_no_stamp(settled: TimeSync) -> None:
+    assert not exchange(settled, OFFSET_NS + 20 * S, offset_ns=OFFSET_NS - 60 * S)
+    assert not settled.vehicle_time(20 * S, OFFSET_NS + 20 * S)  # neither back from it nor ahead of the last
+    assert settled.settled
+    assert settled.counts["reboots"] == settled.counts["jumps_ahead"] == 0
+
+
+def test_replies_that_agree_on_a_jump_of_minutes_tell_it(settled: TimeSync) -> None:
+    for k in range(3):
+        exchange(settled, OFFSET_NS + (20 + k) * S, offset_ns=OFFSET_NS - 60 * S)
+    assert settled.counts["jumps_ahead"] == 1
+    assert settled.counts["reboots"] == 0
