@@ -88,10 +88,12 @@ async def _insist(call: Callable[[], Awaitable[None]]) -> None:
 
     for attempt in range(1, ATTEMPTS + 1):
         try:
-            return await call()
+            await call()
         except ActionError as error:
             if error.result is not ActionResult.TIMEOUT or attempt == ATTEMPTS:
                 raise
+        else:
+            return
 
 
 async def _watch(system: Any, target_enu: tuple[float, float, float], on_step: Callable[[str], None]) -> None:
