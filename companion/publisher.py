@@ -42,11 +42,6 @@ class Publisher:
     def log_hash(self) -> str:
         return self._hash.hexdigest()
 
-    def configured(self, config: Config) -> None:
-        """The profile is settled: the log says with which configuration it is flown."""
-        if self._recorder is not None:
-            self._recorder.config(config, 0)
-
     def tick(
         self,
         record: wire.SetpointRecord,
@@ -82,8 +77,8 @@ class Publisher:
         if self._recorder is not None:
             self._recorder.message(f"/{key}", stamp_ns, payload)
 
-    def retuned(self, config: Config, stamp_ns: int) -> None:
-        """Other live parameters from here on: the log says which."""
+    def configured(self, config: Config, stamp_ns: int) -> None:
+        """The profile is settled, or live parameters changed: the log says what holds from here on."""
         if self._recorder is not None:
             self._recorder.config(config, stamp_ns)
 

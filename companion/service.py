@@ -324,7 +324,7 @@ class Service:
         self._config = config
         self._thinker.adopt(config)
         self._services.adopt(config.vehicle.profile)
-        self._publisher.configured(config)
+        self._publisher.configured(config, self._vehicle_ns)
         self._meter.set_period(1.0 / config.rate_hz)
 
     def _on_restart(self, why: str) -> None:
@@ -344,7 +344,7 @@ class Service:
         self._inbox.retune(config.obstacles.max_age_s)
         self._session.retune(config)
         self._doors.retune(config)
-        self._publisher.retuned(config, self._vehicle_ns)
+        self._publisher.configured(config, self._vehicle_ns)
 
     def _on_change(self) -> None:
         """A command or a marker came by Zenoh: answer the autopilot and look again."""

@@ -98,7 +98,7 @@ class VehicleSession:
 
     def retune(self, config: Config) -> None:
         """Time-outs of ``config`` from now on."""
-        self._config = config
+        self.config = config
 
     @property
     def flies(self) -> bool:
