@@ -52,6 +52,7 @@ class VehicleStateIn(Struct, frozen=True, kw_only=True):
     velocity: Vec
     attitude: tuple[float, float, float, float] | None = None  # (w, x, y, z), enu_from_flu
     position_std: float | None = None
+    covariance: Annotated[list[float], Meta(min_length=21, max_length=21)] | None = None  # instead of position_std
 
 
 class TargetCommand(Struct, frozen=True, kw_only=True):
@@ -84,6 +85,8 @@ class SyncMarker(Struct, frozen=True, kw_only=True):
 
 
 class MarginOut(Struct, frozen=True, kw_only=True):
+    """What a row's keep-out distance is made of [m]."""
+
     radii: float
     cushion: float
     sigma: float
@@ -129,6 +132,8 @@ class VehicleOut(Struct, frozen=True, kw_only=True):
 
 
 class TrackOut(Struct, frozen=True, kw_only=True):
+    """One track, local ENU [m], [m/s], [m/s^2]; its obstacle is a sphere of ``radius``."""
+
     id: str
     position: Vec
     velocity: Vec

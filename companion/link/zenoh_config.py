@@ -157,8 +157,8 @@ def _check_tls(settings: _Settings) -> None:
             context.load_verify_locations(cafile=path)
         except (OSError, ssl.SSLError) as error:
             raise ConfigError(f"{name}: {path}: {_ssl_reason(error)}, expected CA certificates in PEM") from None
-    elif tls["enable_mtls"] and tls["root_ca_certificate_base64"] is None:
-        raise ConfigError(f"{settings.name(f'{_TLS}/enable_mtls')}: expected a CA to check the others against")
+    elif tls["enable_mtls"] and settings.file is None:  # a file may hold the CA itself, which Zenoh does not show
+        raise ConfigError("zenoh.tls.mutual: expected zenoh.tls.ca, to check the others against")
     for side in ("listen", "connect"):
         key, certificate = tls[f"{side}_private_key"], tls[f"{side}_certificate"]
         if key is None or certificate is None:
@@ -230,7 +230,7 @@ def _ssl_reason(error: OSError) -> str:
 
 def _reason(error: zenoh.ZError) -> str:
     """Zenoh's complaint in one line, without where in its own source it was raised."""
-    text = str(error).split(" at /")[0].rstrip()
+    text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error)).rstrip()
     if text.startswith("Invalid configuration"):  # followed by the whole configuration, passwords included
         return "not a valid Zenoh configuration (a user and its password go together)"
     if found := re.search(r'Message \{ msg: "(.*)", location: (?:Some\(Location \{ line: (\d+))?', text, re.S):
