@@ -255,10 +255,9 @@ def test_a_message_beyond_the_bound_is_not_put_together() -> None:
 
     async def scenario() -> None:
         loop, heard = asyncio.get_running_loop(), asyncio.Queue[int]()
-        listener, speaker = (
-            open_session(ZenohConfig(listen=(endpoint,))),
-            open_session(ZenohConfig(connect=(endpoint,))),
-        )
+        remote = session_settings(ZenohConfig(connect=(endpoint,)))
+        remote.insert_json5("transport/shared_memory/enabled", "false")  # as from another host
+        listener, speaker = open_session(ZenohConfig(listen=(endpoint,))), zenoh.open(remote)
         try:
             subscriber = listener.declare_subscriber(
                 "a", lambda sample: loop.call_soon_threadsafe(heard.put_nowait, len(sample.payload))
