@@ -38,6 +38,7 @@ def open_session(config: ZenohConfig) -> zenoh.Session:
             parsed, bound or (client only) reached; names the key or the file.
     """
     settings = session_settings(config)
+    zenoh.try_init_log_from_env()  # RUST_LOG=warn shows whom a link refuses and why; silent without it
     try:
         return zenoh.open(settings)
     except zenoh.ZError as error:

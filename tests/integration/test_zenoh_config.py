@@ -119,6 +119,34 @@ def test_a_client_and_a_peer_meet_at_a_router(tmp_path: Path, form: str) -> None
     asyncio.run(scenario())
 
 
+@pytest.mark.parametrize("mode", ["peer", "client"])
+def test_a_link_comes_back_with_its_router(mode: str) -> None:
+    """A peer may be first, too; a client needs its router when it starts."""
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+
+    async def scenario() -> None:
+        router = None if mode == "peer" else open_session(ZenohConfig(mode="router", listen=(endpoint,)))
+        daemon = open_session(ZenohConfig(mode=mode, connect=(endpoint,)))  # type: ignore[arg-type]
+
+        async def linked(expected: bool) -> None:
+            async with asyncio.timeout(10.0):
+                while bool(list(daemon.info.routers_zid())) is not expected:
+                    await asyncio.sleep(0)
+
+        try:
+            for _ in range(2):
+                if router is None:
+                    router = open_session(ZenohConfig(mode="router", listen=(endpoint,)))
+                await linked(True)
+                router.close()
+                router = None
+                await linked(False)
+        finally:
+            daemon.close()
+
+    asyncio.run(scenario())
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

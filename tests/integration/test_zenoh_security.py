@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -24,6 +25,13 @@ EXAMPLES = Path(__file__).parents[2] / "configs" / "zenoh"
 PREFIX = "uav/uav1"
 TLS, USER = "transport/link/tls", "transport/auth/usrpwd"
 PASSWORDS = {"lidar-host": "laser", "operator": "trust:me", "uav1": "wings"}
+
+
+SPIED = "spied"
+
+
+def _suffix(sample: zenoh.Sample) -> str:
+    return str(sample.key_expr).removeprefix(f"{PREFIX}/")
 
 
 class Daemon:
@@ -52,7 +60,13 @@ class Daemon:
             health=lambda: b"{}",
             on_vehicle=lambda payload, encoding: note("vehicle/state", payload),
         )
-        self.link = ZenohLink.open(config, PREFIX, asyncio.get_running_loop(), handlers)
+        loop = asyncio.get_running_loop()
+        self.link = ZenohLink.open(config, PREFIX, loop, handlers)
+        # zenoh-python gives each subscriber a thread of its own: only one and the same hears in the order of the link
+        self._session = self.link._session
+        self._spy = self._session.declare_subscriber(
+            f"{PREFIX}/**", lambda sample: loop.call_soon_threadsafe(note, SPIED, _suffix(sample))
+        )
 
     async def until(self, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(5.0):
@@ -60,8 +74,20 @@ class Daemon:
                 self._changed.clear()
                 await self._changed.wait()
 
-    async def hears(self, what: str, value: object) -> None:
-        await self.until(lambda: (what, value) in self.heard)
+    async def spied(self) -> list[str]:
+        """Every key of others up to now: a put of our own marks the place."""
+        self._session.put(f"{PREFIX}/mark", b"")
+        await self.until(lambda: (SPIED, "mark") in self.heard)
+        keys = [str(value) for what, value in self.heard if what == SPIED]
+        return keys[: keys.index("mark")]
+
+    def unspy(self) -> None:
+        self._spy.undeclare()
+
+    @property
+    def told(self) -> list[tuple[str, object]]:
+        """What the handlers of the daemon were called with."""
+        return [entry for entry in self.heard if entry[0] != SPIED]
 
 
 def stock(file: str, **values: object) -> zenoh.Config:
@@ -110,12 +136,18 @@ class World:
         self.users.touch(mode=0o600)
         self.users.write_text("".join(f"{name}:{password}\n" for name, password in PASSWORDS.items()))
 
-    def daemon(self, *, controlled: bool = True, mode: str | None = None) -> ZenohConfig:
+    def daemon(self, *, access: str = "shipped") -> ZenohConfig:
         by_certificate = self.by == "certificates"
+        file = EXAMPLES / f"access-{self.by}.json5"
+        if access == "talkative":
+            told = '"declare_subscriber"],\n        key_exprs: ['
+            text = file.read_text(encoding="utf-8")
+            assert told in text
+            file = self.users.with_name("talkative.json5")
+            file.write_text(text.replace(told, told + '"uav/**", '), encoding="utf-8")
         own = self.hosts["uav1"]
         return ZenohConfig(
-            config_file=str(EXAMPLES / f"access-{self.by}.json5") if controlled else None,
-            mode=mode,  # type: ignore[arg-type]
+            config_file=None if access == "none" else str(file),
             listen=(self.endpoint,),
             users_file=None if by_certificate else str(self.users),
             tls=ZenohTlsConfig(
@@ -164,31 +196,36 @@ async def wait_matching(session: zenoh.Session, key: str) -> zenoh.Publisher:
 
 
 @pytest.mark.parametrize("mode", ["client", "peer"])
-@pytest.mark.parametrize("controlled", [True, False])
-def test_a_sensor_publishes_its_own_obstacles_and_nothing_else(world: World, mode: str, controlled: bool) -> None:
-    """The same without access control shows that each of these would have arrived."""
+@pytest.mark.parametrize("access", ["shipped", "talkative", "none"])
+def test_a_sensor_publishes_its_own_obstacles_and_nothing_else(world: World, mode: str, access: str) -> None:
+    """Without access control each attempt succeeds. "talkative" tells the sensor of every subscription, so that it does
+    send what it may not: refused on arrival, not for want of a listener."""
     forbidden = ("obstacles/radar", "vehicle/state", "engage", "target")
+    block = zenoh.CongestionControl.BLOCK
 
     async def scenario(daemon: Daemon) -> None:
         with connected(world.caller("lidar-host", mode=mode)) as sensor:
             frames = await wait_matching(sensor, "obstacles/lidar")
-            if not controlled:
+            if access != "shipped":
                 for key in forbidden:
                     await wait_matching(sensor, key)
             eavesdropper = sensor.declare_subscriber(f"{PREFIX}/companion/**", lambda sample: None)
             for key in forbidden:
                 body = b'{"engaged": true}' if key == "engage" else b'{"position": [1, 2, 3]}'
-                sensor.put(f"{PREFIX}/{key}", body, congestion_control=zenoh.CongestionControl.BLOCK)
+                sensor.put(f"{PREFIX}/{key}", body, congestion_control=block)
             frames.put(b"a frame")  # one link, one priority: it arrives after all that was sent before
-            await daemon.hears("obstacles/lidar", b"a frame")
-            heard = {what for what, _ in daemon.heard} - {"obstacles/lidar"}
-            assert heard == (set() if controlled else set(forbidden))
-            assert daemon.link.wanted("companion/setpoint") is not controlled
+            await daemon.until(lambda: (SPIED, "obstacles/lidar") in daemon.heard)
+            arrived = set(await daemon.spied()) - {"obstacles/lidar"}
+            assert arrived == (set(forbidden) if access == "none" else set())
+            await daemon.until(lambda: ("obstacles/lidar", b"a frame") in daemon.heard)
+            daemon.unspy()
+            assert daemon.link.wanted("companion/setpoint") is (access == "none")
             for key in ("target", "engage"):
-                assert bool(await asyncio.to_thread(ask, sensor, key, b'{"engaged": true}')) is not controlled
+                answers = await asyncio.to_thread(ask, sensor, key, b'{"engaged": true}')
+                assert bool(answers) is (access == "none")
             eavesdropper.undeclare()
 
-    run(world, scenario, controlled=controlled)
+    run(world, scenario, access=access)
 
 
 def test_an_operator_commands_by_query_and_watches(world: World) -> None:
@@ -205,7 +242,7 @@ def test_an_operator_commands_by_query_and_watches(world: World) -> None:
             assert await asyncio.to_thread(ask, operator, "engage", b'{"engaged":true}') == [
                 {"accepted": True, "reason": ""}
             ]
-            assert daemon.heard == [
+            assert daemon.told == [
                 ("target", wire.TargetCommand(position=(1.0, 2.0, 3.0))),
                 ("engage", wire.EngageCommand(engaged=True)),
             ]
@@ -221,7 +258,8 @@ def test_an_operator_commands_by_query_and_watches(world: World) -> None:
             for key in ("engage", "obstacles/operator", "vehicle/state"):  # commands by query only, no obstacles
                 operator.put(f"{PREFIX}/{key}", b'{"engaged": false}', congestion_control=block)
             await asyncio.to_thread(ask, operator, "target", b'{"position":[4,5,6]}')
-            assert [what for what, _ in daemon.heard] == ["target", "engage", "target"]
+            assert await daemon.spied() == ["companion/setpoint"]  # our own
+            assert [what for what, _ in daemon.told] == ["target", "engage", "target"]
 
     run(world, scenario)
 
@@ -269,13 +307,37 @@ def test_a_router_lets_the_daemon_and_its_sensor_meet(world: World) -> None:
             frames = await wait_matching(sensor, "obstacles/lidar")
             sensor.put(f"{PREFIX}/engage", b'{"engaged":true}', congestion_control=zenoh.CongestionControl.BLOCK)
             frames.put(b"through the router")
-            await daemon.hears("obstacles/lidar", b"through the router")
+            await daemon.until(lambda: ("obstacles/lidar", b"through the router") in daemon.heard)
             operator = stack.enter_context(connected(world.caller("operator")))
             answers = await asyncio.to_thread(ask, operator, "engage", b'{"engaged":true}')
             assert answers == [{"accepted": True, "reason": ""}]
-            assert [what for what, _ in daemon.heard] == ["obstacles/lidar", "engage"]
+            assert await daemon.spied() == ["obstacles/lidar"]
+            assert [what for what, _ in daemon.told] == ["obstacles/lidar", "engage"]
 
     asyncio.run(scenario())
+
+
+def test_companion_publish_goes_through_with_a_sensor_s_file(world: World, tmp_path: Path) -> None:
+    text = (EXAMPLES / ("sensor-certificate.json5" if world.by == "certificates" else "sensor-user.json5")).read_text()
+    for shown, ours in (
+        ("/etc/companion/zenoh/ca.pem", str(world.authority.ca)),
+        ("/etc/companion/zenoh/", f"{tmp_path}/"),
+        ("tls/192.0.2.10:7447", world.endpoint),
+        ("change me", PASSWORDS["lidar-host"]),
+    ):
+        text = text.replace(shown, ours)
+    path = tmp_path / "sensor.json5"
+    path.touch(mode=0o600)
+    path.write_text(text)
+
+    async def scenario(daemon: Daemon) -> None:
+        words = ["--zenoh-config", str(path), "--orbit", "center=1,2,1.5 radius=2 speed=1.5", "--duration", "0.1"]
+        words = ["publish", "--key-source", "lidar", *words]
+        process = await asyncio.create_subprocess_exec(sys.executable, "-m", "companion.cli", *words)
+        assert await process.wait() == 0
+        await daemon.until(lambda: (SPIED, "obstacles/lidar") in daemon.heard)
+
+    run(world, scenario)
 
 
 @pytest.mark.parametrize("world", ["certificates"], indirect=True)
