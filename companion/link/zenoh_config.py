@@ -38,7 +38,8 @@ def open_session(config: ZenohConfig) -> zenoh.Session:
             parsed, bound or (client only) reached; names the key or the file.
     """
     settings = session_settings(config)
-    zenoh.try_init_log_from_env()  # RUST_LOG=warn shows whom a link refuses and why; silent without it
+    # RUST_LOG=warn shows whom a link refuses and why; silent without it
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     try:
         return zenoh.open(settings)
     except zenoh.ZError as error:
