@@ -45,6 +45,7 @@ def build_parser() -> argparse.ArgumentParser:
     bench.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")
     schema.add_argument("key", nargs="?", help="one key suffix, such as companion/setpoint; all where left out")
+    schema.add_argument("--keys", action="store_true", help="print every Zenoh key with its quality of service instead")
     schema.set_defaults(handler=_schema)
     return parser
 
@@ -110,6 +111,11 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _schema(arguments: argparse.Namespace) -> int:
+    if arguments.keys:
+        from companion.link.keys import key_page
+
+        print(key_page(), end="")
+        return 0
     from companion.link.wire import json_schemas
 
     schemas = json_schemas()

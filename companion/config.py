@@ -63,11 +63,25 @@ class MavlinkConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     signing: SigningConfig = SigningConfig()
 
 
+class ZenohTlsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """PEM files for endpoints ``tls/HOST:PORT``; one certificate serves listening and connecting."""
+
+    ca: str | None = None  # certificates of the authorities that vouch for the others
+    certificate: str | None = None  # our own
+    private_key: str | None = None  # of it, mode 0600
+    mutual: bool | None = None  # whoever connects must show a certificate too; None: the file's, else false
+
+
 class ZenohConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    mode: Literal["peer", "client"] = "peer"
+    config_file: str | None = None  # a stock Zenoh configuration; what is set here overrides it
+    mode: Literal["peer", "client", "router"] | None = None  # None: the file's, else peer
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
-    multicast_scouting: bool = False
+    multicast_scouting: bool | None = None  # None: the file's, else off
+    user: str | None = None  # our name where we connect
+    password_file: str | None = None  # one line, mode 0600
+    users_file: str | None = None  # lines user:password of those who may connect to us, mode 0600
+    tls: ZenohTlsConfig = ZenohTlsConfig()
 
 
 class TargetConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

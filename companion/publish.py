@@ -59,6 +59,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--name", default="uav1", help="the vehicle: the key starts with uav/NAME (default: uav1)")
     parser.add_argument("--connect", action="append", default=[], metavar="ENDPOINT", help="e.g. tcp/127.0.0.1:7447")
     parser.add_argument("--listen", action="append", default=[], metavar="ENDPOINT", help="listen instead of connect")
+    parser.add_argument("--zenoh-config", metavar="FILE", help="a stock Zenoh configuration, for TLS and passwords")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--from", dest="source", metavar="FILE", help="JSON lines, one frame each; - is standard input")
     for motion, example in _EXAMPLES.items():
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace, *, clock: Clock | None = None) -> int:
     clock = clock or SystemClock()
     _check_options(args)
     key = f"uav/{args.name}/obstacles/{args.key_source}"
-    config = ZenohConfig(connect=tuple(args.connect), listen=tuple(args.listen))
+    config = ZenohConfig(config_file=args.zenoh_config, connect=tuple(args.connect), listen=tuple(args.listen))
     with ExitStack() as stack:
         lines = _lines(args, stack)
         runner = stack.enter_context(asyncio.Runner())

@@ -79,8 +79,16 @@ def vehicle_from_payload(payload: VehicleStateIn) -> VehicleState:
         p_enu=frozen(convert(payload.position)),
         v_enu=frozen(convert(payload.velocity)),
         q_enu_from_flu=frozen(attitude / np.linalg.norm(attitude)),
-        p_std_m=payload.position_std or 0.0,
+        p_std_m=_position_std(payload),
     )
+
+
+def _position_std(payload: VehicleStateIn) -> float:
+    """1-sigma of the position along its worst axis [m]: the brain knows one number for the vehicle; 0 is unknown."""
+    if payload.covariance is None:
+        return payload.position_std or 0.0
+    covariance = _covariance("", payload.covariance, ned=False)  # an eigenvalue has no frame
+    return math.sqrt(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
 
 
 def _check_point(name: str, point: Vec) -> None:
@@ -114,7 +122,7 @@ def _detection(index: int, obstacle: Obstacle, ned: bool) -> Detection:
         p_std_m=obstacle.position_std,
         v_enu=None if velocity is None else frozen(convert(velocity)),
         v_std_m_s=obstacle.velocity_std,
-        covariance=None if obstacle.covariance is None else _covariance(at, obstacle.covariance, ned),
+        covariance=None if obstacle.covariance is None else _covariance(f"{at}.", obstacle.covariance, ned),
     )
 
 
@@ -123,5 +131,5 @@ def _covariance(at: str, values: list[float], ned: bool) -> FloatArray:
     matrix[_UPPER] = matrix[_LOWER] = values
     # NaN fails the first, too
     if not np.abs(matrix).max() <= MAX_STD_M**2 or np.linalg.eigvalsh(matrix)[0] <= 0.0:
-        raise FrameRejected("out_of_range", f"{at}.covariance: expected a finite positive definite 6x6 upper triangle")
+        raise FrameRejected("out_of_range", f"{at}covariance: expected a finite positive definite 6x6 upper triangle")
     return frozen(enu_covariance_from_ned(matrix) if ned else matrix)

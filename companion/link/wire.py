@@ -44,14 +44,19 @@ class ObstacleFrame(Struct, frozen=True, kw_only=True):
 
 
 class VehicleStateIn(Struct, frozen=True, kw_only=True):
-    """`{prefix}/vehicle/state`: the vehicle by Zenoh instead of MAVLink (vehicle.source = "zenoh")."""
+    """`{prefix}/vehicle/state`: the vehicle by Zenoh instead of MAVLink (vehicle.source = "zenoh").
+
+    ``stamp_ns`` is on the vehicle's clock, ``frame`` that of position and velocity; ``attitude`` (w, x, y, z) turns FLU
+    into ENU in either. ``covariance``: upper triangle of 6x6 over (position, velocity), in place of ``position_std``.
+    """
 
     stamp_ns: Nanoseconds
     frame: Frame = "local_enu"
     position: Vec
     velocity: Vec
-    attitude: tuple[float, float, float, float] | None = None  # (w, x, y, z), enu_from_flu
+    attitude: tuple[float, float, float, float] | None = None
     position_std: float | None = None
+    covariance: Annotated[list[float], Meta(min_length=21, max_length=21)] | None = None
 
 
 class TargetCommand(Struct, frozen=True, kw_only=True):
@@ -84,6 +89,8 @@ class SyncMarker(Struct, frozen=True, kw_only=True):
 
 
 class MarginOut(Struct, frozen=True, kw_only=True):
+    """What a row's keep-out distance is made of [m]."""
+
     radii: float
     cushion: float
     sigma: float
@@ -130,6 +137,8 @@ class VehicleOut(Struct, frozen=True, kw_only=True):
 
 
 class TrackOut(Struct, frozen=True, kw_only=True):
+    """One track, local ENU [m], [m/s], [m/s^2]; its obstacle is a sphere of ``radius``."""
+
     id: str
     position: Vec
     velocity: Vec

@@ -1,12 +1,6 @@
 """The Zenoh session of the daemon: keys, quality of service, and the way from Zenoh's thread into the loop.
 
-Quality of service, and why:
-
-- ``companion/setpoint``, ``vehicle``, ``tracks``: one message a tick. Live they are DROP: a slow reader must not
-  delay a tick, and the next record makes up for a lost one. In lockstep they are BLOCK: the simulator waits for each.
-- ``companion/status`` is DROP: it repeats at 5 Hz.
-- setpoint records are express (no batching) and above the rest in priority: they are what latency is measured by.
-- replies to queries take the quality of service of their query.
+Keys and their quality of service are in ``link/keys.py``.
 
 Callbacks run on a thread of Zenoh's: they copy, wake the loop and return. At most 4096 messages wait for the loop,
 the oldest are dropped and counted.
@@ -15,7 +9,6 @@ the oldest are dropped and counted.
 from __future__ import annotations
 
 import asyncio
-import json
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -27,6 +20,8 @@ from companion.config import ZenohConfig
 from companion.errors import ConfigError, FrameRejected
 from companion.link import wire
 from companion.link.inbox import MAX_PAYLOAD_BYTES
+from companion.link.keys import OUTLETS
+from companion.link.zenoh_config import open_session as open_session
 
 MAX_WAITING = 4096
 
@@ -53,54 +48,6 @@ class ZenohHandlers:
     on_vehicle: Callable[[bytes, str], None] | None = None  # vehicle.source = "zenoh" only
     on_rejected: Callable[[str, FrameRejected], None] = lambda key, error: None
     extra: Mapping[str, OnPayload] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class _Outlet:
-    """Quality of service of one outgoing key."""
-
-    priority: zenoh.Priority
-    express: bool
-    each_tick: bool
-
-
-_OUTLETS = {
-    "companion/setpoint": _Outlet(zenoh.Priority.DATA_HIGH, express=True, each_tick=True),
-    "companion/vehicle": _Outlet(zenoh.Priority.DATA, express=False, each_tick=True),
-    "companion/tracks": _Outlet(zenoh.Priority.DATA_LOW, express=False, each_tick=True),
-    "companion/status": _Outlet(zenoh.Priority.DATA, express=False, each_tick=False),
-}
-
-
-def open_session(config: ZenohConfig) -> zenoh.Session:
-    """A session as configured. Nothing listens and nothing is scouted beyond what the configuration names.
-
-    Raises:
-        ConfigError: an endpoint that cannot be parsed or bound; names the key.
-    """
-    settings = zenoh.Config()
-    for key, value in (
-        ("mode", config.mode),
-        ("scouting/multicast/enabled", config.multicast_scouting),
-        ("scouting/gossip/enabled", False),
-        ("connect/endpoints", config.connect),
-        ("listen/endpoints", config.listen),
-    ):
-        try:
-            settings.insert_json5(key, json.dumps(value))
-        except zenoh.ZError:
-            name = key.split("/")[0]
-            raise ConfigError(
-                f"zenoh.{name}: expected endpoints such as tcp/127.0.0.1:7447, got {json.dumps(value)}"
-            ) from None
-    try:
-        return zenoh.open(settings)
-    except zenoh.ZError as error:
-        reason = str(error).split(" at /")[0]
-        raise ConfigError(
-            f"zenoh: cannot open mode {config.mode}, listen {json.dumps(config.listen)},"
-            f" connect {json.dumps(config.connect)}: {reason}"
-        ) from None
 
 
 class ZenohLink:
@@ -170,7 +117,7 @@ class ZenohLink:
             self._session.close()  # type: ignore[no-untyped-call]
 
     def _declare(self, lockstep: bool) -> None:
-        for key, outlet in _OUTLETS.items():
+        for key, outlet in OUTLETS.items():
             block = lockstep and outlet.each_tick
             self._publishers[key] = self._session.declare_publisher(
                 f"{self._prefix}/{key}",

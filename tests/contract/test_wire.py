@@ -249,6 +249,60 @@ def test_media_type_wins_over_the_guess() -> None:
     assert refuse(json.dumps(frame()).encode(), wire.MSGPACK).reason == "malformed"
 
 
+def vehicle(**changes: Any) -> dict[str, Any]:
+    return {"stamp_ns": NOW_NS, "position": [1.0, 2.0, 3.0], "velocity": [4.0, 5.0, 6.0]} | changes
+
+
+def test_the_vehicle_by_zenoh_comes_in_either_frame() -> None:
+    level_facing_north = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+    for frame_name, position, velocity in (
+        ("local_enu", [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]),
+        ("local_ned", [2.0, 1.0, -3.0], [5.0, 4.0, -6.0]),
+    ):
+        payload = vehicle(frame=frame_name, position=position, velocity=velocity, attitude=level_facing_north)
+        state = ingress.vehicle_from_payload(wire.decode(json.dumps(payload).encode(), wire.VehicleStateIn))
+        assert state.stamp_ns == NOW_NS
+        assert state.p_enu.tolist() == [1.0, 2.0, 3.0]
+        assert state.v_enu.tolist() == [4.0, 5.0, 6.0]
+        assert state.q_enu_from_flu == pytest.approx(level_facing_north)
+        assert state.p_std_m == 0.0
+
+
+def test_the_vehicle_s_covariance_counts_by_its_worst_axis() -> None:
+    """Independent of the library: a diagonal turned by 45 degrees in the horizontal plane keeps its largest value."""
+    cosine = math.sqrt(0.5)
+    turn = np.array([[cosine, -cosine, 0.0], [cosine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    matrix = np.eye(6)
+    matrix[:3, :3] = turn @ np.diag([0.25, 0.04, 0.09]) @ turn.T
+    triangle = [matrix[i, j] for i in range(6) for j in range(i, 6)]
+    for frame_name in ("local_enu", "local_ned"):
+        payload = vehicle(frame=frame_name, covariance=triangle, position_std=9.0)
+        assert ingress.vehicle_from_payload(
+            wire.decode(json.dumps(payload).encode(), wire.VehicleStateIn)
+        ).p_std_m == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"position": [1e5, 0, 0]}, "position"),
+        ({"velocity": [0, math.nan, 0]}, "velocity"),
+        ({"velocity": [0, 1e4, 0]}, "velocity"),
+        ({"stamp_ns": -1}, "stamp_ns"),
+        ({"position_std": 0.0}, "position_std"),
+        ({"attitude": [0.0, 0.0, 0.0, 0.0]}, "attitude"),
+        ({"attitude": [math.nan, 0.0, 0.0, 1.0]}, "attitude"),
+        ({"covariance": [0.0] * 21}, "covariance"),
+        ({"covariance": [math.inf] * 21}, "covariance"),
+    ],
+)
+def test_a_vehicle_state_out_of_bounds_is_refused(changes: dict[str, Any], field: str) -> None:
+    payload = wire.decode(packed(vehicle(**changes)), wire.VehicleStateIn)
+    with pytest.raises(FrameRejected, match=rf"^out_of_range: {field}: expected") as caught:
+        ingress.vehicle_from_payload(payload)
+    assert "\n" not in str(caught.value)
+
+
 def test_commands_and_markers() -> None:
     assert wire.decode(b'{"engaged":true}', wire.EngageCommand) == wire.EngageCommand(engaged=True)
     target = wire.decode(b'{"position":[1,2,3],"frame":"local_enu","yaw":null}', wire.TargetCommand)

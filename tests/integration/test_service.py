@@ -242,6 +242,63 @@ def test_the_vehicle_state_may_come_by_zenoh() -> None:
     assert run(script, zenoh={"listen": [endpoint]}, vehicle={"source": "zenoh"}).ticks > 0
 
 
+def test_the_vehicle_by_zenoh_is_what_the_brain_uses_and_mavlink_is_not() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        loop, heard = asyncio.get_running_loop(), asyncio.Queue()
+        with neighbour(endpoint) as session:
+            watching = session.declare_subscriber(
+                "uav/uav1/companion/vehicle", lambda sample: loop.call_soon_threadsafe(heard.put_nowait, sample)
+            )
+            states = session.declare_publisher("uav/uav1/vehicle/state")
+            body = {"frame": "local_ned", "position": [1.0, 2.0, -3.0], "velocity": [0.1, 0.2, -0.3]}
+            stamp_ms = 0
+            while heard.empty():
+                stamp_ms += 50
+                states.put(json.dumps({**body, "stamp_ns": stamp_ms * 1_000_000}))
+                await autopilot.fly()  # MAVLink says (0, 0, 2), north up
+            vehicle = json.loads((await heard.get()).payload.to_bytes())
+            assert (vehicle["position"], vehicle["velocity"]) == ([2.0, 1.0, 3.0], [0.2, 0.1, 0.3])
+            assert 0 < vehicle["stamp_ns"] <= stamp_ms * 1_000_000
+            watching.undeclare()
+
+    assert run(script, zenoh={"listen": [endpoint]}, vehicle={"source": "zenoh"}).ticks > 0
+
+
+def test_a_stock_query_is_told_what_came_of_a_target_and_an_engagement() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+
+    async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
+        with neighbour(endpoint) as session:
+
+            async def ask(key: str, body: object) -> dict[str, Any]:
+                def get() -> bytes:
+                    (reply,) = session.get(f"uav/uav1/{key}", payload=json.dumps(body), timeout=5.0)
+                    return reply.ok.payload.to_bytes()
+
+                return json.loads(await asyncio.to_thread(get))
+
+            probe = session.declare_publisher("uav/uav1/engage")
+            while not probe.matching_status.matching:
+                await autopilot.fly()
+            await autopilot.fly(3)
+            assert await ask("target", {"position": [1, 2, 3]}) == {"accepted": True, "reason": ""}
+            refused = await ask("target", {"position": [1000, 0, 3]})
+            assert not refused["accepted"]
+            assert "arena" in refused["reason"]
+            assert service._route.current.tolist() == [1.0, 2.0, 3.0]
+            assert await ask("engage", {"engaged": True}) == {"accepted": True, "reason": ""}
+            while not autopilot.mode_requests():
+                await autopilot.fly()
+            autopilot.mode = OFFBOARD
+            while service._session.situation.state.value != "ACTIVE":
+                await autopilot.fly()
+            assert await ask("engage", {"engaged": False}) == {"accepted": True, "reason": ""}
+
+    run(script, zenoh={"listen": [endpoint]})
+
+
 def test_a_reboot_that_shows_in_timesync_first_is_noticed() -> None:
     async def script(service: Service, brain: Failing, autopilot: Autopilot) -> None:
         autopilot.answers_time = True
