@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -51,6 +51,7 @@ class MavlinkCodec:
         self._mav = dialect.MAVLink(None, system, mav.COMPONENT)
         self._texts = TextAssembler()
         self._next_text_id = 1
+        self.on_message: Callable[[Any], None] | None = None  # shown every intact message, before it is decoded
 
     @property
     def system(self) -> int:
@@ -73,6 +74,8 @@ class MavlinkCodec:
         """
         events: list[Event] = []
         for message in self._framer.push(data):
+            if self.on_message is not None:
+                self.on_message(message)
             kind = message.get_msgId()  # not .id: STATUSTEXT has a field of that name
             decode = DECODERS.get(kind)
             try:
@@ -223,6 +226,10 @@ class MavlinkCodec:
                 link_rx_max=[_UINT32_UNKNOWN] * 6,
             )
         )
+
+    def pack(self, message: Any) -> bytes:
+        """Bytes of any pymavlink message, as sent by this component on this link."""
+        return self._pack(message)
 
     def _pack(self, message: Any) -> bytes:
         packet: bytes = message.pack(self._mav)
