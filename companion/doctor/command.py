@@ -109,12 +109,14 @@ def observe(config: Config, duration_s: float, fixes: list[tuple[str, float]]) -
     from rich.console import Console
 
     from companion.clock import SystemClock
+    from companion.doctor import machine as host
     from companion.doctor.listen import listen
-    from companion.doctor.machine import examine
+    from companion.link.transports import parse_url
 
+    parse_url(config.mavlink.url)  # wrong configuration is told before anything is measured
     console = Console(stderr=True)
     with console.status("timing the brain on this machine") as status:
-        machine = examine(config)
+        machine = host.examine(config, steps=host.STEPS)
         status.update(f"listening to {config.mavlink.url} and Zenoh, at least {duration_s:g} s")
         link, zenoh = asyncio.run(listen(config, SystemClock(), duration_s=duration_s, fixes=fixes))
     return Observation(duration_s, link, zenoh, machine)

@@ -35,7 +35,7 @@ class _Write:
     wanted: float
     sent_ns: int | None = None
     tries: int = 0
-    asked: bool = False  # the new read
+    reads: int = 0  # since the last set
     result: Fix | None = None
     before: float | int | None = None
     answer: float | int | None = None
@@ -73,7 +73,7 @@ class ParameterDialogue:
             return
         read.value, read.param_type = parameters.read_value(message, self.kind), message.param_type
         for write in self._writes:
-            if write.name == message.param_id and write.asked and write.result is None:
+            if write.name == message.param_id and write.reads and write.result is None:
                 write.answer = read.value
 
     def poll(self, now_ns: int) -> list[Any]:
@@ -111,8 +111,8 @@ class ParameterDialogue:
             return self._begin(write, read, now_ns) if read.over(now_ns) else []
         if now_ns - write.sent_ns < REPEAT_NS and write.answer is None:
             return []
-        if not write.asked:  # the autopilot has had its time: what does it say now?
-            write.asked, write.sent_ns = True, now_ns
+        if write.reads < TRIES and write.answer is None:  # the autopilot has had its time: what does it say now?
+            write.reads, write.sent_ns = write.reads + 1, now_ns
             return [parameters.request(write.name, self.system, self.component)]
         arrived = write.answer is not None and same_value(write.answer, write.wanted)
         if arrived or write.tries >= TRIES:
@@ -138,6 +138,6 @@ class ParameterDialogue:
         return self._set(write, read, now_ns)
 
     def _set(self, write: _Write, read: _Read, now_ns: int) -> list[Any]:
-        write.sent_ns, write.tries, write.asked, write.answer = now_ns, write.tries + 1, False, None
+        write.sent_ns, write.tries, write.reads, write.answer = now_ns, write.tries + 1, 0, None
         wire = parameters.wire_value(write.wanted, read.param_type, self.kind)
         return [parameters.setting(write.name, wire, read.param_type, self.system, self.component)]

@@ -15,7 +15,7 @@ from companion.doctor.observation import Link, Zenoh
 from companion.doctor.sources import SourceLog
 from companion.errors import ConfigError
 from companion.link.mavlink import MavlinkCodec
-from companion.link.transports import Transport, open_transport, parse_url
+from companion.link.transports import Transport, open_transport
 from companion.link.zenoh import open_session
 from companion.session import EXTENDED_SYS_STATE_HZ
 from companion.types import NS_PER_S
@@ -39,10 +39,8 @@ async def listen(
 ) -> tuple[Link, Zenoh]:
     """Both sides at once, for ``duration_s`` after the autopilot was found.
 
-    Raises:
-        ConfigError: an URL that is none. A link that is well named and cannot be opened is part of the answer.
+    A link that cannot be opened is part of the answer.
     """
-    parse_url(config.mavlink.url)
     codec = MavlinkCodec(system=config.mavlink.system_id or 1)
     probe = MavlinkProbe(
         codec,

@@ -28,7 +28,7 @@ _SECRET_WORDS = ("key", "password", "secret", "credential", "dictionary")
 _FILE_WORDS = ("file", "path")
 
 
-def examine(config: Config, *, steps: int = STEPS, stopwatch: Callable[[], int] = stopwatch_ns) -> Machine:
+def examine(config: Config, *, steps: int, stopwatch: Callable[[], int] = stopwatch_ns) -> Machine:
     """Everything about this machine; failures are part of the answer."""
     digest = artifact_error = deadline = deadline_error = None
     try:
