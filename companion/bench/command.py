@@ -175,7 +175,7 @@ def _wire(arguments: argparse.Namespace) -> int:
     measured: list[Any] = []
     _run([("the wire", lambda: measured.extend(wire.measure(quick=arguments.quick)))])
     latency, parsing = measured
-    figures = wire.figures(latency, parsing)
+    figures = wire.figures(latency)
     if arguments.json:
         _print_json(envelope("wire", wire.as_json(latency, parsing), figures))
     else:

@@ -30,6 +30,7 @@ class Notes(msgspec.Struct):
     stamps_ns: list[int] = []  # of the frames as they came, to tell which were lost
     taken: dict[int, int] = {}
     tasks: list[str] = []
+    tick_ms: dict[str, float] = {}  # the daemon's own figure: state received to setpoint sent
 
 
 class NotingPilot(Pilot):
@@ -69,7 +70,7 @@ async def serve(path: Path) -> Notes:
     service = Service(config, clock, pilot=pilot)
     note_arrivals(service._inbox, notes, clock)
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, service.stop)
-    await service.run()
+    notes.tick_ms = (await service.run()).tick_ms
     return notes
 
 
