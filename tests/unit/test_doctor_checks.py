@@ -30,6 +30,7 @@ from companion.doctor.observation import (
     Timesync,
     Zenoh,
 )
+from companion.doctor.parameters import NAMES
 from companion.doctor.verdict import Check, Level, worst
 from companion.errors import ConfigError
 from companion.safety.qp import Infeasible, Program
@@ -364,3 +365,8 @@ def test_the_deadline_is_what_the_stopwatch_says() -> None:
     readings = iter(range(0, 10**12, 3_000_000))  # 3 ms a reading
     deadline = measure_deadline(CONFIG, obstacles=2, steps=5, stopwatch=lambda: next(readings))
     assert (deadline.p50_ms, deadline.p99_ms, deadline.max_ms) == (3.0, 3.0, 3.0)
+
+
+def test_the_documentation_names_every_parameter_that_is_read() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "doctor.md").read_text(encoding="utf-8")
+    assert [name for names in NAMES.values() for name in names if f"| {name} (" not in text] == []

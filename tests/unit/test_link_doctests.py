@@ -8,7 +8,10 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("name", ["link.mavlink", "link.timesync", "link.url", "publish"])
+@pytest.mark.parametrize(
+    "name",
+    ["link.mavlink", "link.timesync", "link.url", "publish", "doctor.command", "doctor.observation", "doctor.verdict"],
+)
 def test_docstring_examples(name: str) -> None:
     outcome = doctest.testmod(importlib.import_module(f"companion.{name}"))
     assert outcome.attempted > 0
