@@ -15,6 +15,7 @@ from companion.doctor.verdict import Check, Level, grade, skip
 LONGEST_LOSS_S = 1.0  # without setpoints and without an answer of the autopilot
 LONGEST_COAST_S = 1.0  # of ArduPilot on the last acceleration
 JERK_M_S3 = 5.0  # ArduPilot's default, under which its response was measured
+SLEW_SHARE = 1.25  # setpoints may change faster than the jerk limit by this much: what follows late stays small
 G_M_S2 = 9.81
 
 OBL_ACTIONS = {
@@ -144,13 +145,14 @@ def _guided_options(value: float, config: Config) -> Check:
 
 def _jerk(value: float, config: Config) -> Check:
     slew = config.limits.slew_m_s3
-    within = "" if slew is None else f", limits.slew_m_s3 is {slew:g}"
+    least = max(JERK_M_S3, (slew or 0.0) / SLEW_SHARE)
+    within = "" if slew is None else f", setpoints change by up to {slew:g} m/s^3"
     return grade(
         "PSC_JERK_XY",
         f"{value:g} m/s^3{within}: {config.limits.acceleration_m_s2 / value if value > 0 else 0:.1f} s to full"
         " acceleration",
-        f"at least {max(JERK_M_S3, slew or 0.0):g} m/s^3, for which the profile's delay stands",
-        warn=value < max(JERK_M_S3, slew or 0.0),
+        f"at least {least:g} m/s^3, for which the profile's delay stands",
+        warn=value < least,
     )
 
 

@@ -99,7 +99,7 @@ class MavlinkProbe:
             out.extend(self._ask_streams(now_ns))
             out.extend(self._ask_time(now_ns))
             if self._dialogue is not None:
-                out.extend(self._codec.pack(message) for message in self._dialogue.poll(now_ns))
+                out.extend(self._codec.encode(message) for message in self._dialogue.poll(now_ns))
         return out
 
     def finished(self, now_ns: int) -> bool:

@@ -227,8 +227,8 @@ class MavlinkCodec:
             )
         )
 
-    def pack(self, message: Any) -> bytes:
-        """Bytes of any pymavlink message, as sent by this component on this link."""
+    def encode(self, message: Any) -> bytes:
+        """A pymavlink message that another module has built."""
         return self._pack(message)
 
     def _pack(self, message: Any) -> bytes:
