@@ -20,6 +20,7 @@ _EPILOG = """\
 examples:
   companion demo                              fly the simulated vehicle through crossing obstacles
   companion run -c configs/default.toml       the daemon, beside an autopilot
+  companion doctor -c configs/default.toml    is everything fit to fly, and what if the daemon dies?
   companion publish --orbit "center=1,2,1.5 radius=2 speed=1.5" --connect tcp/127.0.0.1:7447
                                               publish a made-up obstacle
 """
@@ -39,9 +40,11 @@ def build_parser() -> argparse.ArgumentParser:
     from companion import publish
     from companion.bench import command as bench
     from companion.demo import command as demo
+    from companion.doctor import command as doctor
 
     demo.add_parser(commands)
     publish.add_parser(commands)
+    doctor.add_parser(commands)
     bench.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")
     schema.add_argument("key", nargs="?", help="one key suffix, such as companion/setpoint; all where left out")

@@ -1,4 +1,4 @@
-"""The parameters that exist here, under PX4's names; each acts for real.
+"""The parameters that exist here, under PX4's names; each acts for real, or is a constant of this vehicle.
 
 Integers travel bytewise in the float field of PARAM_VALUE (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE).
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+
+from sim_bridge.crazyflie import Crazyflie
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,13 +21,17 @@ class Definition:
     choices: tuple[int, ...] = ()
 
 
+_HOVER_THRUST = 1.0 / Crazyflie().thrust_to_weight
+
 DEFINITIONS: dict[str, Definition] = {
     "COM_DISARM_LAND": Definition(2.0, 0.0, 20.0),  # landed to disarmed [s]
     "COM_DISARM_PRFLT": Definition(10.0, 0.0, 60.0),  # armed without taking off to disarmed [s], 0: never
     "COM_OBL_RC_ACT": Definition(5, 0, 7, choices=(4, 5)),  # setpoint stream lost: Land 4 or Hold 5
     "COM_OF_LOSS_T": Definition(1.0, 0.1, 60.0),  # setpoint stream lost after [s]
+    "COM_RCL_EXCEPT": Definition(7, 7, 7),  # constant: there is no remote control to lose, in any mode
     "MIS_TAKEOFF_ALT": Definition(1.5, 0.5, 80.0),  # above home [m]
     "MPC_LAND_SPEED": Definition(0.5, 0.1, 2.0),  # [m/s]
+    "MPC_THR_HOVER": Definition(_HOVER_THRUST, _HOVER_THRUST, _HOVER_THRUST),  # constant: share of full thrust
     "MPC_TKO_SPEED": Definition(1.0, 0.3, 3.0),  # [m/s]
     "MPC_XY_VEL_P_ACC": Definition(1.8, 0.5, 5.0),  # velocity error to acceleration [1/s]
 }

@@ -18,6 +18,7 @@ examples:
   companion bench tracking --json > tracking.json
   companion bench filter                  time of the safety filter beside cbfpy, OSQP and quadprog (minutes)
   companion bench filter --quick --json   fewer states and flights, one JSON object
+  companion bench wire                    obstacle frame to setpoint on real sockets, and messages parsed a second
 """
 
 _TRACKING = """\
@@ -34,6 +35,13 @@ Times the safety filter (rows, solve, verify, whole) over states in which some r
 with the same obstacles. The filter's programs are given to DAQP, OSQP and quadprog too. Then whole flights past
 obstacles, with and without noise, in which sign changes of the correction are counted. Seeds are fixed. cbfpy and
 quadprog are in the bench extra; without them their columns are left out.
+"""
+
+_WIRE = """\
+Runs the daemon as a process on real UDP and Zenoh sockets of the loopback, beside an autopilot that streams its state
+at 50 Hz and a sensor that publishes ten obstacles at random phases, and measures from the publication of a frame to
+the first setpoint that knows it, beyond its wait for the next state message. Then messages a second off a UDP socket,
+by our transport and codec and by pymavlink's mavutil, in turn.
 """
 
 TICKS = 1000  # timed with one and ten obstacles, a tenth with a hundred
@@ -58,6 +66,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     safety = _add_part(parts, "filter", _filter, "the safety filter: time where it acts, solvers, chatter", _FILTER)
     safety.add_argument("--quick", action="store_true", help="the conditions with figures only, on fewer states")
+    wire = _add_part(parts, "wire", _wire, "obstacle frame to setpoint, and messages parsed a second", _WIRE)
+    wire.add_argument("--quick", action="store_true", help="a flight of 12 s instead of 90")
 
 
 def _add_part(
@@ -155,6 +165,21 @@ def _filter(arguments: argparse.Namespace) -> int:
         _print_json(envelope("filter", filter.as_json(times, solved, encounters, free_s), figures))
     else:
         print_filter(times, solved, encounters, free_s, figures)
+    return 0
+
+
+def _wire(arguments: argparse.Namespace) -> int:
+    from companion.bench import wire
+    from companion.bench.envelope import envelope
+
+    measured: list[Any] = []
+    _run([("the wire", lambda: measured.extend(wire.measure(quick=arguments.quick)))])
+    latency, parsing = measured
+    figures = wire.figures(latency)
+    if arguments.json:
+        _print_json(envelope("wire", wire.as_json(latency, parsing), figures))
+    else:
+        wire.print_wire(latency, parsing, figures)
     return 0
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -59,6 +59,7 @@ class MavlinkCodec:
             self._mav.signing.secret_key, self._mav.signing.sign_outgoing = b"", True
         self._texts = TextAssembler()
         self._next_text_id = 1
+        self.on_message: Callable[[Any], None] | None = None  # shown every intact message, before it is decoded
 
     @property
     def system(self) -> int:
@@ -100,6 +101,8 @@ class MavlinkCodec:
         """Events in messages of a framer, as by ``receive``."""
         events: list[Event] = []
         for message in messages:
+            if self.on_message is not None:
+                self.on_message(message)
             kind = message.get_msgId()  # not .id: STATUSTEXT has a field of that name
             decode = _DECODERS.get(kind)
             try:

@@ -47,7 +47,7 @@ LAYERS = [
         "companion.publisher",
         "companion.doors",
     },
-    {"companion.service", "companion.publish", "companion.demo", "companion.bench"},
+    {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]
 BRAIN = (

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from companion.bench import accuracy, cbfpy_rival, chatter, command, filter, timing, tracking
+from companion.bench import accuracy, cbfpy_rival, chatter, command, filter, timing, tracking, wire
 from companion.cli import main
 
 
@@ -116,6 +116,32 @@ def test_filter_without_rivals_says_how_to_get_them(
         assert name not in told.out.replace("and cbfpy [ms]", "")
     for text in ("whole", "ours (osqp)", "sign changes", "crossing", "figures"):
         assert text in told.out
+
+
+@pytest.mark.parametrize("form", ["--json", "--quick"])
+def test_the_wire_is_measured_on_real_sockets(
+    form: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One and a half seconds of flight; the figures depend on the machine and are not tested."""
+    for name, value in (("WARM_S", 0.2), ("MEASURED_S", 1.5), ("QUICK_MEASURED_S", 1.5)):
+        monkeypatch.setattr(wire, name, value)
+    for name in ("ROUNDS", "QUICK_ROUNDS"):
+        monkeypatch.setattr(wire, name, 2)
+    assert main(["bench", "wire", form]) == 0
+    out = capsys.readouterr().out
+    if form == "--quick":
+        for text in ("beyond the wait", "mavutil recv_match", "figures"):
+            assert text in out
+        return
+    told = json.loads(out)
+    assert told["bench"] == "wire"
+    latency, parsing = told["results"]["latency_ms"], told["results"]["parsing"]
+    assert latency["frames"] > 5
+    assert latency["lost"] <= latency["frames"]
+    assert 0.0 < latency["delivery"]["p50"] <= latency["beyond"]["p50"] <= latency["whole"]["p50"]
+    assert parsing["ours_per_s"] > 0
+    assert parsing["mavutil_per_s"] > 0
+    assert told["figures"][0]["limit"] == 2.0
 
 
 @pytest.mark.slow

@@ -11,6 +11,9 @@ import pytest
 @pytest.mark.parametrize(
     "name",
     [
+        "doctor.command",
+        "doctor.observation",
+        "doctor.verdict",
         "hostload",
         "link.identity",
         "link.mav",
