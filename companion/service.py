@@ -74,6 +74,7 @@ class Service:
             self._session.request_message,
             elapsed_ns=None if self._lockstep else clock.monotonic_ns,
         )
+        self._session.origin = lambda: self._traffic.origin
         self._barrier = LockstepBarrier(config, self._inbox, clock)
         self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
         self._time = TimeBase(clock, self._codec, self._transport.send, self._on_restart, runs=not self._lockstep)

@@ -14,10 +14,11 @@ from companion.config import Config
 from companion.confirm import ECHO_HZ
 from companion.latch import AutopilotLatch
 from companion.link import mav
-from companion.link.decode import CommandRefused, reposition_target
 from companion.link.events import Attitude, Command, Heartbeat, LandedState, Position, SetpointEcho, SetpointHeard
 from companion.link.events import Event as LinkEvent
+from companion.link.geo import TangentPlane
 from companion.link.mavlink import MavlinkCodec
+from companion.link.reposition import CommandRefused, OriginUnknown, reposition_target
 from companion.modes import ModeRequests
 from companion.profiles import BY_AUTOPILOT
 from companion.requests import StreamRequests
@@ -58,6 +59,7 @@ class VehicleSession:
         self.situation = Situation()
         self.armed = False
         self.custom_mode: int | None = None
+        self.origin: Callable[[], TangentPlane | None] = lambda: None  # of the local frame, where somebody knows it
         self._attitude: Attitude | None = None
         self._system: int | None = None
         self._component: int | None = None
@@ -310,8 +312,10 @@ class VehicleSession:
 
     def _reposition(self, command: Command) -> int:
         try:
-            target_enu = reposition_target(command)
+            target_enu = reposition_target(command, self.origin())
         except CommandRefused as refused:
+            if isinstance(refused, OriginUnknown):
+                self.request_message(mav.MSG_GPS_GLOBAL_ORIGIN)
             return refused.result
         return mav.RESULT_ACCEPTED if self._on_target(target_enu) is None else mav.RESULT_DENIED
 

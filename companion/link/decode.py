@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from companion.errors import CompanionError
 from companion.frames import rotate
 from companion.link import mav
 from companion.link.events import (
@@ -40,34 +39,6 @@ _MAX_PARTIAL_TEXTS = 16
 
 class Rejected(Exception):
     """A message dropped whole; its text is the name under which it is counted."""
-
-
-class CommandRefused(CompanionError):
-    """A command that cannot be followed; ``result`` is the MAV_RESULT to acknowledge it with."""
-
-    def __init__(self, result: int, detail: str) -> None:
-        super().__init__(detail)
-        self.result = result
-
-
-def reposition_target(command: Command) -> Vec3:
-    """The target of a MAV_CMD_DO_REPOSITION, ENU [m].
-
-    Only the COMMAND_INT form in MAV_FRAME_LOCAL_NED: x (north) and y (east) in 1e-4 m, z (down) in m.
-
-    Raises:
-        CommandRefused: with the MAV_RESULT to answer.
-    """
-    if not command.is_int:
-        raise CommandRefused(mav.RESULT_COMMAND_INT_ONLY, "DO_REPOSITION: expected as COMMAND_INT")
-    if command.frame != mav.FRAME_LOCAL_NED:
-        raise CommandRefused(
-            mav.RESULT_COMMAND_UNSUPPORTED_MAV_FRAME,
-            f"DO_REPOSITION: expected frame MAV_FRAME_LOCAL_NED (1), got {command.frame}",
-        )
-    if not math.isfinite(command.z):
-        raise CommandRefused(mav.RESULT_DENIED, f"DO_REPOSITION: expected a finite z, got {command.z}")
-    return frozen([command.y * 1e-4, command.x * 1e-4, -command.z])
 
 
 def heartbeat(m: Any) -> list[Event]:

@@ -15,7 +15,6 @@ import pytest
 
 from companion.frames import q_enu_from_flu
 from companion.link import mav
-from companion.link.decode import CommandRefused, reposition_target
 from companion.link.events import (
     Attitude,
     Command,
@@ -29,7 +28,9 @@ from companion.link.events import (
     TimesyncReply,
     TimesyncRequest,
 )
+from companion.link.geo import TangentPlane
 from companion.link.mavlink import MavlinkCodec, SetpointRefused
+from companion.link.reposition import CommandRefused, OriginUnknown, reposition_target
 from companion.profiles import PROFILES
 
 CRC_EXTRA = {
@@ -415,11 +416,30 @@ def test_reposition_in_local_ned_is_a_target_in_enu() -> None:
     assert reposition_target(command) == pytest.approx([-2.0, 12.3456, 1.5])
 
 
-@pytest.mark.parametrize(("change", "result"), [({"frame": 6}, 9), ({"z": math.nan}, 2)])
+@pytest.mark.parametrize("frame", [0, 5])
+def test_reposition_in_a_global_frame_goes_through_the_origin(frame: int) -> None:
+    """A thousandth of a degree at 47.4 N is 111.179 m north or 75.487 m east (WGS84 radii of curvature)."""
+    origin = TangentPlane(47.4, 8.5, 400.0)
+    (command,) = receive(75, command_int(x=474_010_000, y=85_010_000, z=412.0, frame=frame))
+    assert reposition_target(command, origin) == pytest.approx([75.487, 111.179, 12.0], abs=0.005)
+    with pytest.raises(OriginUnknown) as caught:
+        reposition_target(command)
+    assert caught.value.result == mav.RESULT_TEMPORARILY_REJECTED == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "result"),
+    [
+        ({"frame": 6}, 9),
+        ({"z": math.nan}, 2),
+        ({"frame": 0, "x": 910_000_000}, 2),
+        ({"frame": 0, "y": -1_810_000_000}, 2),
+    ],
+)
 def test_reposition_refusals_carry_their_result(change: dict[str, float], result: int) -> None:
     (command,) = receive(75, command_int(**change))
     with pytest.raises(CommandRefused) as caught:
-        reposition_target(command)
+        reposition_target(command, TangentPlane(0.0, 0.0, 0.0))
     assert caught.value.result == result
 
 

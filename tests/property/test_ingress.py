@@ -17,10 +17,11 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.errors import FrameRejected
 from companion.link import wire
-from companion.link.decode import DECODERS, CommandRefused, reposition_target
+from companion.link.decode import DECODERS
 from companion.link.events import Command
 from companion.link.inbox import ObstacleInbox
 from companion.link.mavlink import MavlinkCodec, SetpointRefused
+from companion.link.reposition import CommandRefused, reposition_target
 from companion.link.timesync import TimeSync
 
 any_float = st.floats(width=64) | st.sampled_from([math.nan, math.inf, -math.inf, 1e308, -0.0, 5e-324])

@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.config import Config, parse_config
 from companion.link.events import Attitude, Command, Heartbeat, LandedState, Position
+from companion.link.geo import TangentPlane
 from companion.link.mavlink import MavlinkCodec
 from companion.session import VehicleSession
 from companion.state import State
@@ -229,6 +230,15 @@ def test_reposition_takes_the_int_form_only(rig: Rig) -> None:
     assert rig.command(192, 0.0) == 8  # COMMAND_INT_ONLY
     assert rig.command(192, 0.0, is_int=True, frame=1) == 0
     np.testing.assert_allclose(rig.targets[-1], [2.0, 1.0, 3.0])  # NED (1, 2, -3) m in ENU
+
+
+def test_a_global_target_waits_for_the_origin_and_asks_for_it(rig: Rig) -> None:
+    rig.beat(1.0)
+    assert rig.command(192, 0.0, is_int=True, frame=0) == 1  # TEMPORARILY_REJECTED
+    asked = [(m.command, int(m.param1)) for m in rig.messages("COMMAND_LONG") if m.command == 512]
+    assert asked == [(512, 49)]
+    rig.session.origin = lambda: TangentPlane(0.0, 0.0, -10.0)
+    assert rig.command(192, 0.0, is_int=True, frame=0) == 0
 
 
 def test_unknown_commands_are_unsupported(rig: Rig) -> None:
