@@ -101,6 +101,7 @@ class VehicleSession:
     def retune(self, config: Config) -> None:
         """Time-outs of ``config`` from now on."""
         self.config = config
+        self._modes.adopt(config)
 
     @property
     def flies(self) -> bool:

@@ -419,8 +419,8 @@ def test_reposition_in_local_ned_is_a_target_in_enu() -> None:
 @pytest.mark.parametrize("frame", [0, 5])
 def test_reposition_in_a_global_frame_goes_through_the_origin(frame: int) -> None:
     """A thousandth of a degree at 47.4 N is 111.179 m north or 75.487 m east (WGS84 radii of curvature)."""
-    origin = TangentPlane(47.4, 8.5, 400.0)
-    (command,) = receive(75, command_int(x=474_010_000, y=85_010_000, z=412.0, frame=frame))
+    origin = TangentPlane(47.4, 8.5, 0.0)
+    (command,) = receive(75, command_int(x=474_010_000, y=85_010_000, z=12.0, frame=frame))
     assert reposition_target(command, origin) == pytest.approx([75.487, 111.179, 12.0], abs=0.005)
     with pytest.raises(OriginUnknown) as caught:
         reposition_target(command)
