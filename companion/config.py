@@ -13,29 +13,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from companion.config_check import check_arena, check_confirmation, check_reserve, check_ros2, check_tick, pointed
+from companion.config_links import MavlinkConfig, Ros2Config, ZenohConfig
 from companion.config_traffic import UNTRUSTED, TrafficConfig, check_traffic
+from companion.config_types import Acceleration, Name, NonNegative, Point, Positive, Section, SourceName, Stay
 from companion.errors import ConfigError
 from companion.profiles import PROFILES, UNDECIDED, Profile
-
-Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
-NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]
-Acceleration = Annotated[float, Meta(gt=0.0, le=1e3)]  # what a setpoint on the wire may hold
-Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
-SourceName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,128}$")]
-Topic = Annotated[str, Meta(pattern=r"^/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$", max_length=120)]
-FrameId = Annotated[str, Meta(min_length=1, max_length=64)]
-TypeHash = Annotated[str, Meta(pattern=r"^RIHS01_[0-9a-f]{64}$")]
-KeyPrefix = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*)?$")]
-Stay = Annotated[float, Meta(gt=0.34, lt=1.0)]
-Point = tuple[Coordinate, Coordinate, Coordinate]
-
-
-class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of the file."""
 
 
 class VehicleConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -44,44 +29,6 @@ class VehicleConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     setpoint: Literal["acceleration", "velocity+acceleration"] = "acceleration"  # the latter for autopilots that damp
     source: Literal["mavlink", "zenoh"] = "mavlink"
     stale_s: Positive = 0.5  # a vehicle state older than this is no longer fresh
-
-
-class SigningConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    key_file: str | None = None  # of mode 0600; None: nothing is signed and nothing needs to be
-    state_file: str | None = None  # timestamps kept over restarts; None: the clock alone
-    link_id: Annotated[int, Meta(ge=0, le=247)] = 0  # of mavlink.url; mavlink.links count up from it
-    allow_unsigned: tuple[Literal["RADIO_STATUS", "ADSB_VEHICLE"], ...] = ("RADIO_STATUS", "ADSB_VEHICLE")
-
-
-class MavlinkConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    url: str = "udpin://0.0.0.0:14540"
-    system_id: Annotated[int, Meta(ge=1, le=255)] | None = None  # None: latch the one autopilot heard for 3 s
-    heartbeat_timeout_s: Positive = 5.0
-    links: Annotated[tuple[str, ...], Meta(max_length=8)] = ()  # further links: ground station, sensors
-    forward: bool = False  # pass messages on between the links
-    block_other_setpoints: bool = False  # do not pass on setpoints of others to the autopilot while we fly it
-    signing: SigningConfig = SigningConfig()
-
-
-class ZenohTlsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """PEM files for endpoints ``tls/HOST:PORT``; one certificate serves listening and connecting."""
-
-    ca: str | None = None  # certificates of the authorities that vouch for the others
-    certificate: str | None = None  # our own
-    private_key: str | None = None  # of it, mode 0600
-    mutual: bool | None = None  # whoever connects must show a certificate too; None: the file's, else false
-
-
-class ZenohConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    config_file: str | None = None  # a stock Zenoh configuration; what is set here overrides it
-    mode: Literal["peer", "client", "router"] | None = None  # None: the file's, else peer
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
-    multicast_scouting: bool | None = None  # None: the file's, else off
-    user: str | None = None  # our name where we connect
-    password_file: str | None = None  # one line, mode 0600
-    users_file: str | None = None  # lines user:password of those who may connect to us, mode 0600
-    tls: ZenohTlsConfig = ZenohTlsConfig()
 
 
 class TargetConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -99,18 +46,6 @@ class ObstaclesConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     silent_s: Positive = 1.0
     max_age_s: Positive = 0.5
     queue: Annotated[int, Meta(ge=1, le=4096)] = 64
-
-
-class Ros2Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Topics of ROS 2 nodes on rmw_zenoh; off while none is named. Needs the extra ``ros2``."""
-
-    domain_id: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the nodes
-    detections: tuple[Topic, ...] = ()  # of vision_msgs/Detection3DArray
-    tracked_objects: tuple[Topic, ...] = ()  # of autoware_perception_msgs/TrackedObjects
-    frame_id: FrameId = "map"  # must be the vehicle's local ENU frame
-    other_frame_ids: tuple[FrameId, ...] = ()  # that coincide with it, such as "odom"
-    key_prefix: KeyPrefix = ""  # before the domain, where the nodes' session has a namespace
-    type_hashes: tuple[TypeHash, ...] = ()  # of releases known to be laid out as the current ones
 
 
 class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -21,7 +21,7 @@ import msgspec
 import zenoh
 
 from companion.clock import Clock, SystemClock
-from companion.config import ZenohConfig
+from companion.config_links import ZenohConfig
 from companion.errors import ConfigError, FrameRejected
 from companion.link import ingress, wire
 from companion.link.zenoh import open_session

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -240,6 +241,7 @@ class _Wire:
 
     def __init__(self) -> None:
         self.sent = bytearray()
+        self.counts: Counter[str] = Counter()
 
     def send(self, data: bytes) -> None:
         self.sent += data
@@ -254,7 +256,7 @@ class World:
         self.config = parse_config({"vehicle": {"profile": "auto"}, **sections})
         self.service = Service(self.config, self.clock, pilot=Pilot(self.config))
         self.wire, self.zenoh = _Wire(), _Nobody()
-        self.service._transport = self.wire  # type: ignore[assignment]
+        self.service._transport._links = (self.wire,)  # type: ignore[assignment]
         self.service._publisher = Publisher(self.zenoh, None)  # type: ignore[arg-type]
         self.gcs = dialect.MAVLink(None, 255, 190)
         self.connected = True
@@ -278,7 +280,7 @@ class World:
     def give(self, data: bytes) -> None:
         """Bytes on the vehicle's link, from whoever made them."""
         if data and self.connected:
-            self.service._on_bytes(data)
+            self.service._transport._on_bytes(0, data)
 
     def engage(self, on: bool = True) -> None:
         """An operator's MAV_CMD_NAV_GUIDED_ENABLE to component 196."""

@@ -24,8 +24,8 @@ _EP2 = E2 / (1.0 - E2)
 class TangentPlane:
     """Local east, north, up about a point of the earth.
 
-    >>> TangentPlane(47.0, 8.0, 400.0).enu(47.0, 8.0, 410.0).round(6).tolist()
-    [0.0, 0.0, 10.0]
+    >>> TangentPlane(47.0, 8.0, 400.0).enu(47.0, 8.001, 410.0).round(3).tolist()
+    [76.061, 0.0, 10.0]
     """
 
     lat_deg: float

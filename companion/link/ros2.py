@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import Any
 
-from companion.config import Ros2Config
+from companion.config_links import Ros2Config
 from companion.errors import FrameRejected
 from companion.link.inbox import MAX_PAYLOAD_BYTES, ObstacleInbox
 from companion.link.ros2_obstacles import frame_from_detections, frame_from_tracked_objects

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.clock import Clock
-from companion.config import MavlinkConfig
+from companion.config_links import MavlinkConfig
 from companion.errors import ConfigError
 from companion.link import mav
 from companion.link.events import Event

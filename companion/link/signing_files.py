@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from companion.config import SigningConfig
+from companion.config_links import SigningConfig
 from companion.errors import ConfigError
 from companion.link.signing import KEY_BYTES, Signing, SigningState
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import zenoh
 
-from companion.config import ZenohConfig
+from companion.config_links import ZenohConfig
 from companion.errors import ConfigError, FrameRejected
 from companion.link import wire
 from companion.link.inbox import MAX_PAYLOAD_BYTES

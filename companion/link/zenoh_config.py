@@ -17,7 +17,7 @@ from typing import Any
 
 import zenoh
 
-from companion.config import ZenohConfig
+from companion.config_links import ZenohConfig
 from companion.errors import ConfigError
 from companion.link.inbox import MAX_PAYLOAD_BYTES
 

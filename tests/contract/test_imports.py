@@ -16,7 +16,13 @@ PACKAGES = ("companion", "sim_bridge", "policies")
 LAYERS = [
     {"companion", "companion.__version__", "companion.types", "companion.errors"},
     {"companion.frames", "companion.profiles", "companion.clock"},
-    {"companion.config", "companion.config_check", "companion.config_traffic"},
+    {
+        "companion.config",
+        "companion.config_check",
+        "companion.config_links",
+        "companion.config_traffic",
+        "companion.config_types",
+    },
     {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload"},
     {
         "companion.tracking",
@@ -116,7 +122,7 @@ def test_companion_imports_flow_one_way(path: Path) -> None:
 
 
 def test_link_knows_types_and_frames_only() -> None:
-    allowed = {"types", "errors", "frames", "profiles", "clock", "config", "config_traffic", "link"}
+    allowed = {"types", "errors", "frames", "profiles", "clock", "config", "config_links", "config_traffic", "link"}
     for path in modules("companion/link"):
         for name in imported(path):
             if name.startswith("companion."):

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from companion.config import SigningConfig, parse_config
+from companion.config import parse_config
+from companion.config_links import SigningConfig
 from companion.errors import ConfigError
 from companion.link import mav
 from companion.link.events import Event, TimesyncReply

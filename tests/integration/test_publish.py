@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import ZenohConfig
+from companion.config_links import ZenohConfig
 from companion.errors import ConfigError
 from companion.link.zenoh import open_session
 from companion.publish import add_parser, parse_motion, run

@@ -21,7 +21,8 @@ import zenoh
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.clock import SystemClock
-from companion.config import Ros2Config, ZenohConfig, parse_config
+from companion.config import parse_config
+from companion.config_links import Ros2Config, ZenohConfig
 from companion.link import wire
 from companion.link.inbox import ObstacleInbox
 from companion.link.ros2 import subscriptions

@@ -15,7 +15,8 @@ import pytest
 import zenoh
 from certificates import Authority
 
-from companion.config import Config, ZenohConfig, ZenohTlsConfig, parse_config
+from companion.config import Config, parse_config
+from companion.config_links import ZenohConfig, ZenohTlsConfig
 from companion.errors import ConfigError
 from companion.link.inbox import MAX_PAYLOAD_BYTES
 from companion.link.zenoh_config import MAX_MESSAGE_BYTES, open_session, session_settings

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 from certificates import Authority, Host
 
-from companion.config import ZenohConfig, ZenohTlsConfig
+from companion.config_links import ZenohConfig, ZenohTlsConfig
 from companion.link import wire
 from companion.link.zenoh import ZenohHandlers, ZenohLink
 from sim_bridge.testing import free_port

@@ -10,7 +10,7 @@ import ros2_oracle as oracle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.config import Ros2Config
+from companion.config_links import Ros2Config
 from companion.link.inbox import ObstacleInbox
 from companion.link.ros2 import subscriptions
 

@@ -14,7 +14,8 @@ import pytest
 import ros2_oracle as oracle
 from scipy.spatial.transform import Rotation
 
-from companion.config import Ros2Config, parse_config
+from companion.config import parse_config
+from companion.config_links import Ros2Config
 from companion.errors import ConfigError, FrameRejected
 from companion.frames import rotate
 from companion.link.inbox import MAX_PAYLOAD_BYTES, ObstacleInbox
