@@ -63,6 +63,7 @@ class Service:
         self._transport = Router(config.mavlink, self._codec, self._session, clock, self._on_events)
         self._inbox = ObstacleInbox(
             queue=config.obstacles.queue,
+            per_tick=config.obstacles.per_tick,
             max_age_s=config.obstacles.max_age_s,
             sources=(*config.lockstep_sources, *config.obstacles.required),
             on_report=log.warning,

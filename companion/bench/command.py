@@ -6,6 +6,7 @@ import argparse
 import importlib.util
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -41,7 +42,8 @@ _WIRE = """\
 Runs the daemon as a process on real UDP and Zenoh sockets of the loopback, beside an autopilot that streams its state
 at 50 Hz and a sensor that publishes ten obstacles at random phases, and measures from the publication of a frame to
 the first setpoint that knows it, beyond its wait for the next state message. Then messages a second off a UDP socket,
-by our transport and codec and by pymavlink's mavutil, in turn.
+by our transport and codec and by pymavlink's mavutil, in turn. Then a load of 1000 frames of 20 obstacles and 2000
+MAVLink messages a second for a minute: ticks lost, and memory.
 """
 
 TICKS = 1000  # timed with one and ten obstacles, a tenth with a hundred
@@ -67,7 +69,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     safety = _add_part(parts, "filter", _filter, "the safety filter: time where it acts, solvers, chatter", _FILTER)
     safety.add_argument("--quick", action="store_true", help="the conditions with figures only, on fewer states")
     wire = _add_part(parts, "wire", _wire, "obstacle frame to setpoint, and messages parsed a second", _WIRE)
-    wire.add_argument("--quick", action="store_true", help="a flight of 12 s instead of 90")
+    wire.add_argument("--quick", action="store_true", help="12 s of flight instead of 90, 10 s of load instead of 60")
 
 
 def _add_part(
@@ -169,17 +171,25 @@ def _filter(arguments: argparse.Namespace) -> int:
 
 
 def _wire(arguments: argparse.Namespace) -> int:
-    from companion.bench import wire
+    from companion.bench import wire, wire_load
     from companion.bench.envelope import envelope
 
     measured: list[Any] = []
-    _run([("the wire", lambda: measured.extend(wire.measure(quick=arguments.quick)))])
-    latency, parsing = measured
-    figures = wire.figures(latency)
+    seconds = wire_load.QUICK_LOAD_S if arguments.quick else wire_load.LOAD_S
+    _run(
+        [
+            ("the wire", lambda: measured.extend(wire.measure(quick=arguments.quick))),
+            ("the load", lambda: measured.append(wire_load.measure_load(seconds))),
+        ]
+    )
+    latency, parsing, load = measured
+    figures = [*wire.figures(latency), *wire_load.figures(load)]
     if arguments.json:
-        _print_json(envelope("wire", wire.as_json(latency, parsing), figures))
+        _print_json(envelope("wire", wire.as_json(latency, parsing) | {"load": asdict(load)}, figures))
     else:
-        wire.print_wire(latency, parsing, figures)
+        wire.print_wire(latency, parsing)
+        wire_load.print_load(load)
+        wire.print_figures(figures)
     return 0
 
 

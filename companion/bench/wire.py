@@ -58,7 +58,7 @@ def measure_latency(measured_s: float, *, warm_s: float) -> Latency:
     Raises:
         CompanionError: the daemon did not come up or did not fly.
     """
-    port, endpoint = _free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
+    port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     with tempfile.TemporaryDirectory(prefix="companion-bench-") as folder:
         config, log = Path(folder) / "daemon.toml", Path(folder) / "daemon.log"
         config.write_text(
@@ -146,7 +146,7 @@ def as_json(latency: Latency, parsing: Parsing) -> dict[str, Any]:
     }
 
 
-def print_wire(latency: Latency, parsing: Parsing, told: list[Figure]) -> None:
+def print_wire(latency: Latency, parsing: Parsing) -> None:
     """Tables for people."""
     from rich.console import Console
     from rich.table import Table
@@ -169,13 +169,17 @@ def print_wire(latency: Latency, parsing: Parsing, told: list[Figure]) -> None:
         f"messages parsed a second off UDP (medians of {parsing.rounds} rounds of {parsing.datagrams}):"
         f" ours {parsing.ours_per_s:,.0f}, mavutil recv_match {parsing.theirs_per_s:,.0f}\n"
     )
-    console.print("figures (on a busy machine the tails of time are the scheduler's)")
+
+
+def print_figures(told: list[Figure]) -> None:
+    """Measured values beside their limits."""
+    print("figures (on a busy machine the tails of time are the scheduler's)")
     for figure in told:
         met = "met" if figure.met else "MISSED"
-        console.print(f"  {figure.name}: {figure.value:.2f}, {figure.relation} {figure.limit:g}: {met}")
+        print(f"  {figure.name}: {figure.value:.4g}, {figure.relation} {figure.limit:g}: {met}")
 
 
-def _free_port(kind: socket.SocketKind) -> int:
+def free_port(kind: socket.SocketKind) -> int:
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

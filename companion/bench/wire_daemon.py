@@ -1,6 +1,6 @@
 """The daemon of `companion bench wire`: the real service on real sockets, with notes of when it learned what.
 
-    python -m companion.bench.wire_daemon CONFIG.toml
+    python -m companion.bench.wire_daemon CONFIG.toml [--plain]
 
 Ends on SIGTERM with one JSON object on stdout. Two taps, nothing else differs from `companion run`: the instant at
 which a frame reaches the service's loop, and the tick whose brain step took it. The monotonic clock is the machine's,
@@ -31,6 +31,7 @@ class Notes(msgspec.Struct):
     taken: dict[int, int] = {}
     tasks: list[str] = []
     tick_ms: dict[str, float] = {}  # the daemon's own figure: state received to setpoint sent
+    counts: dict[str, int] = {}  # and everything that it counted
 
 
 class NotingPilot(Pilot):
@@ -62,17 +63,21 @@ def note_arrivals(inbox: ObstacleInbox, notes: Notes, clock: Clock) -> None:
     inbox.push = noted  # type: ignore[method-assign]
 
 
-async def serve(path: Path) -> Notes:
-    """Fly until SIGTERM."""
+async def serve(path: Path, *, plain: bool) -> Notes:
+    """Fly until SIGTERM; ``plain`` leaves the taps out, whose notes grow."""
     config, clock, notes = load_config(path), SystemClock(), Notes()
-    pilot = NotingPilot(config)
-    pilot.notes = notes
-    service = Service(config, clock, pilot=pilot)
-    note_arrivals(service._inbox, notes, clock)
+    if plain:
+        service = Service(config, clock)
+    else:
+        pilot = NotingPilot(config)
+        pilot.notes = notes
+        service = Service(config, clock, pilot=pilot)
+        note_arrivals(service._inbox, notes, clock)
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, service.stop)
-    notes.tick_ms = (await service.run()).tick_ms
+    summary = await service.run()
+    notes.tick_ms, notes.counts = summary.tick_ms, summary.counts
     return notes
 
 
 if __name__ == "__main__":
-    sys.stdout.buffer.write(msgspec.json.encode(asyncio.run(serve(Path(sys.argv[1])))))
+    sys.stdout.buffer.write(msgspec.json.encode(asyncio.run(serve(Path(sys.argv[1]), plain="--plain" in sys.argv[2:]))))

@@ -39,11 +39,12 @@ class ObstacleInbox:
     Args:
         sources: those configured; they keep their place however many strangers publish (at most 64 in all).
         queue: frames held for a source.
+        per_tick: frames of a source that a tick uses.
         max_age_s: an older frame is rejected at the tick that would use it.
         on_report: told about rejected frames in one line, at most once a second of vehicle time.
         doors: sources of the daemon's own (`push_decoded`); what is published under their names is rejected.
 
-    ``counts`` has frames (accepted), dropped (queue full) and every reason of rejection.
+    ``counts`` has frames (accepted), dropped (queue full), thinned and every reason of rejection.
     """
 
     def __init__(
@@ -51,12 +52,14 @@ class ObstacleInbox:
         *,
         queue: int,
         max_age_s: float,
+        per_tick: int = 4096,
         sources: Iterable[str] = (),
         on_report: Callable[[str], None] | None = None,
         doors: Iterable[str] = (),
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._queue = queue
+        self._per_tick = per_tick
         self._max_age_s = max_age_s
         self._on_report = on_report
         self._doors = frozenset(doors)
@@ -151,9 +154,7 @@ class ObstacleInbox:
         """
         frames: list[DetectionFrame] = []
         for name, entry in self._sources.items():
-            limit = self._limit(entry, now_ns)
-            while entry.queue and entry.queue[0][0] < limit:
-                sequence, payload, encoding = entry.queue.popleft()
+            for sequence, payload, encoding in self._taken(entry, self._limit(entry, now_ns)):
                 try:
                     frame = ingress.detections_from_frame(
                         _decoded(payload, encoding),
@@ -172,6 +173,21 @@ class ObstacleInbox:
         self._report(now_ns)
         frames.sort(key=lambda frame: frame.order_key)
         return tuple(frames)
+
+    def _taken(self, entry: _Source, limit: float) -> list[tuple[int, Payload, str | None]]:
+        """A source's frames of this tick: all, or of more than ``per_tick`` the newest and others evenly before it.
+
+        Every frame is a whole picture, so a source that is much faster than the ticks costs no tick its deadline.
+        """
+        taken = []
+        while entry.queue and entry.queue[0][0] < limit:
+            taken.append(entry.queue.popleft())
+        if len(taken) > self._per_tick:
+            stride = -(-len(taken) // self._per_tick)
+            kept = taken[::-1][::stride][::-1]
+            self.counts["thinned"] += len(taken) - len(kept)
+            return kept
+        return taken
 
     def reset(self) -> None:
         """Forget queues, markers and sources (the vehicle's clock began again); the counts stay."""

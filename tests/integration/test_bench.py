@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from companion.bench import accuracy, cbfpy_rival, chatter, command, filter, timing, tracking, wire
+from companion.bench import accuracy, cbfpy_rival, chatter, command, filter, timing, tracking, wire, wire_load
 from companion.cli import main
 
 
@@ -127,10 +127,12 @@ def test_the_wire_is_measured_on_real_sockets(
         monkeypatch.setattr(wire, name, value)
     for name in ("ROUNDS", "QUICK_ROUNDS"):
         monkeypatch.setattr(wire, name, 2)
+    for name, value in (("WARM_S", 0.2), ("LOAD_S", 1.5), ("QUICK_LOAD_S", 1.5)):
+        monkeypatch.setattr(wire_load, name, value)
     assert main(["bench", "wire", form]) == 0
     out = capsys.readouterr().out
     if form == "--quick":
-        for text in ("beyond the wait", "mavutil recv_match", "figures"):
+        for text in ("beyond the wait", "mavutil recv_match", "ticks lost", "figures"):
             assert text in out
         return
     told = json.loads(out)
@@ -142,6 +144,13 @@ def test_the_wire_is_measured_on_real_sockets(
     assert parsing["ours_per_s"] > 0
     assert parsing["mavutil_per_s"] > 0
     assert told["figures"][0]["limit"] == 2.0
+    load = told["results"]["load"]
+    assert load["states"] > 40
+    assert load["frames_sent"] > 1500
+    assert load["messages_sent"] > 3000
+    assert load["frames_used"] + load["frames_thinned"] > 1000
+    assert load["frames_thinned"] > load["frames_used"] > 0
+    assert load["memory_mib"] > 50.0
 
 
 @pytest.mark.slow

@@ -225,3 +225,18 @@ def test_frames_of_other_doors_queue_with_the_rest_and_are_decoded_when_drained(
     assert calls == [30 * MS]
     expected = {"dropped": 1, "frame_id": 1, "too_many_sources": 2, "frames": 2 + MAX_SOURCES - 2}
     assert inbox.counts == expected
+
+
+def test_a_source_faster_than_the_ticks_is_thinned_evenly_and_keeps_its_newest() -> None:
+    inbox = ObstacleInbox(queue=64, max_age_s=10.0, per_tick=4)
+    for n in range(10):
+        inbox.push("fast", frame(stamp_ns=n))
+    inbox.push("slow", frame(stamp_ns=5))
+    taken = inbox.drain(30 * MS)
+    assert [(f.source, f.stamp_ns) for f in taken if f.source == "fast"] == [("fast", n) for n in (0, 3, 6, 9)]
+    assert [f.stamp_ns for f in taken if f.source == "slow"] == [5]
+    assert (inbox.counts["thinned"], inbox.counts["frames"]) == (6, 5)
+    for n in range(4):
+        inbox.push("fast", frame(stamp_ns=20 + n))
+    assert len(inbox.drain(30 * MS)) == 4
+    assert inbox.counts["thinned"] == 6
