@@ -13,16 +13,20 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.config import parse_config
+from companion.config_links import Ros2Config
 from companion.errors import ConfigError, FrameRejected
 from companion.link import mav, wire
 from companion.link.decode import DECODERS
+from companion.link.decode_traffic import TRAFFIC_DECODERS
 from companion.link.inbox import ObstacleInbox
 from companion.link.mavlink import MavlinkCodec
+from companion.link.ros2 import subscriptions
+from companion.link.ros2_types import UNHASHED
 from companion.types import NS_PER_S
 
 Target = Callable[[bytes], None]
 _NOW_NS = 1_000 * NS_PER_S
-READ = (*DECODERS, mav.MSG_COMMAND_LONG, mav.MSG_COMMAND_INT, mav.MSG_STATUSTEXT)
+READ = (*DECODERS, *TRAFFIC_DECODERS, mav.MSG_COMMAND_LONG, mav.MSG_COMMAND_INT, mav.MSG_STATUSTEXT)
 _FORGET = 4096  # inputs, after which the state that a door keeps begins anew, so that inputs stay reproducible
 
 
@@ -76,6 +80,25 @@ class Obstacles:
             self._inbox.reset()
 
 
+class Cdr:
+    """A ROS 2 message, Detection3DArray or TrackedObjects by its first byte, through the inbox to the brain's type."""
+
+    def __init__(self) -> None:
+        config = Ros2Config(detections=("seen",), tracked_objects=("tracked",))
+        self._inbox, self._count = ObstacleInbox(queue=4, max_age_s=1e9), 0
+        self._doors = [(key.replace("*", UNHASHED), door) for key, door in subscriptions(config, self._inbox).items()]
+
+    def __call__(self, data: bytes) -> None:
+        self._count += 1
+        key, door = self._doors[data[0] % 2 if data else 0]
+        door(key, data[1:], "")
+        for frame in self._inbox.drain(_NOW_NS, unix_minus_vehicle_ns=0):
+            for detection in frame.detections:
+                assert np.isfinite(detection.p_enu).all()
+        if self._count % _FORGET == 0:
+            self._inbox.reset()
+
+
 def commands(data: bytes) -> None:
     """Targets, engagement, vehicle states and markers."""
     kinds: tuple[Any, ...] = (wire.TargetCommand, wire.EngageCommand, wire.VehicleStateIn, wire.SyncMarker)
@@ -100,6 +123,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "mavlink_payload": MavlinkPayload,
     "obstacles": Obstacles,
     "commands": lambda: commands,
+    "cdr": Cdr,
     "configuration": lambda: configuration,
 }
 
@@ -114,6 +138,14 @@ def seeds(name: str) -> list[bytes]:
         ball = wire.Obstacle(id="a", position=(1.0, 2.0, 3.0), radius=0.2, position_std=0.1, velocity=(0.0, 1.0, 0.0))
         frame = wire.ObstacleFrame(stamp_ns=_NOW_NS, clock="vehicle", obstacles=[ball, ball])
         return [wire.encode(frame, encoding) for encoding in (wire.JSON, wire.MSGPACK)]
+    if name == "cdr":
+        from ros2_oracle import Detection3DArray as Detections
+        from ros2_oracle import TrackedObjects, cdr, detection, header, tracked
+
+        stamp = header(_NOW_NS)
+        seen = Detections(header=stamp, detections=[detection(1.0, 2.0, 3.0, name="a")])
+        objects = TrackedObjects(header=stamp, objects=[tracked(1)])
+        return [bytes([index]) + cdr(message) for index, message in enumerate((seen, objects))]
     if name == "commands":
         written = (
             wire.TargetCommand(position=(1.0, 2.0, 3.0)),

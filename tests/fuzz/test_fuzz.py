@@ -15,10 +15,11 @@ pytest.importorskip("atheris")
 RUN = Path(__file__).with_name("run.py")
 GROWTH_KIB = 40 * 1024  # libFuzzer's own corpus grows with what it finds; a leak of 100 bytes an input would show
 RUNS = {
-    "mavlink": 250_000,
+    "mavlink": 200_000,
     "mavlink_payload": 250_000,
     "obstacles": 250_000,
-    "commands": 200_000,
+    "commands": 150_000,
+    "cdr": 100_000,
     "configuration": 50_000,
 }
 
