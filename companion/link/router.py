@@ -173,14 +173,14 @@ class Router:
         self.counts["other_setpoints"] += 1
         if not self._operator.flies:
             return False
-        blocked = self._blocks and link != AUTOPILOT_LINK
-        self.counts["blocked_setpoints"] += blocked
+        if not self._blocks or link == AUTOPILOT_LINK:
+            return False  # that it is there is told by who watches the autopilot
+        self.counts["blocked_setpoints"] += 1
         now_ns = self._clock.monotonic_ns()
         if sender not in self._told_ns or now_ns - self._told_ns[sender] >= TELL_NS:
             self._told_ns = {s: ns for s, ns in self._told_ns.items() if now_ns - ns < TELL_NS} | {sender: now_ns}
-            suffix = ", blocked" if blocked else ": two fly now"
-            self._operator.say(mav.SEVERITY_WARNING, f"{sender[0]}/{sender[1]} sends setpoints too{suffix}")
-        return blocked
+            self._operator.say(mav.SEVERITY_WARNING, f"setpoints of {sender[0]}/{sender[1]} are blocked")
+        return True
 
 
 def _is_autopilot(message: Any) -> bool:

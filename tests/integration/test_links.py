@@ -150,8 +150,8 @@ def test_forwarding_and_a_second_setpoint_sender() -> None:
         world.station.send(
             world.station.mav.set_position_target_local_ned_encode(7, 1, 1, 1, 0xDF8, *[0] * 11)
         )  # as an Offboard plugin left running
-        warning = "255/190 sends setpoints too: two fly now"
-        await world.until(lambda: warning in [m.text for m in world.station.of("STATUSTEXT")])
+        warning = "second setpoint sender: 255/190 SET_POSITION_TARGET_LOCAL_NED"
+        await world.until(lambda: warning in "".join(m.text for m in world.station.of("STATUSTEXT")))
         assert len(world.autopilot.of(SETPOINT, component=190)) == 1
         world.command(400, 1, 0.0)
         await world.until(lambda: world.autopilot.of("COMMAND_LONG", component=190))
