@@ -13,7 +13,7 @@ PYTHON := python3
 endif
 
 SAFETY_TESTS := tests/unit/test_safety_*.py tests/property/test_safety_properties.py
-PILOT_TESTS := tests/unit/test_pilot.py tests/unit/test_disturbance.py
+PILOT_TESTS := tests/unit/test_pilot.py tests/unit/test_disturbance.py tests/unit/test_retune.py
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-slow coverage mutants check format clean
