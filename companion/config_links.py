@@ -22,7 +22,7 @@ class SigningConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class MavlinkConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    url: str = "udpin://0.0.0.0:14540"
+    url: str = "udpin://127.0.0.1:14540"
     system_id: Annotated[int, Meta(ge=1, le=255)] | None = None  # None: latch the one autopilot heard for 3 s
     heartbeat_timeout_s: Positive = 5.0
     links: Annotated[tuple[str, ...], Meta(max_length=8)] = ()  # further links: ground station, sensors
