@@ -46,7 +46,7 @@ class ObstaclesConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=
     silent_s: Positive = 1.0
     max_age_s: Positive = 0.5
     queue: Annotated[int, Meta(ge=1, le=4096)] = 64
-    per_tick: Annotated[int, Meta(ge=1, le=4096)] = 4  # frames of a source that a tick uses; a faster one is thinned
+    per_tick: Annotated[int, Meta(ge=1, le=4096)] = 3  # frames of a source that a tick uses; a faster one is thinned
 
 
 class TrackingConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
