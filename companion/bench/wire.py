@@ -16,9 +16,10 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -29,6 +30,9 @@ from companion.bench.wire_daemon import Notes
 from companion.bench.wire_peer import OBSTACLES, Seen, fly
 from companion.clock import SystemClock
 from companion.errors import CompanionError
+
+T = TypeVar("T")
+Daemon = subprocess.Popen[bytes]
 
 RATE_HZ = 50
 WARM_S = 2.0
@@ -58,6 +62,30 @@ def measure_latency(measured_s: float, *, warm_s: float) -> Latency:
     Raises:
         CompanionError: the daemon did not come up or did not fly.
     """
+
+    def live(port: int, endpoint: str, daemon: Daemon) -> Seen:
+        return fly(
+            port,
+            endpoint,
+            SystemClock(),
+            rate_hz=RATE_HZ,
+            warm_s=warm_s,
+            measured_s=measured_s,
+            alive=lambda: daemon.poll() is None,
+        )
+
+    seen, notes = beside_daemon(live)
+    if "fly" not in notes.tasks:
+        raise CompanionError("bench wire: the daemon never flew")
+    return evaluate(seen, notes)
+
+
+def beside_daemon(live: Callable[[int, str, Daemon], T], *flags: str) -> tuple[T, Notes]:
+    """Run ``live(MAVLink port, Zenoh endpoint, process)`` beside a daemon; its result, and the daemon's notes.
+
+    Raises:
+        CompanionError: ``live`` or the daemon's end took too long; with the end of the daemon's log.
+    """
     port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     with tempfile.TemporaryDirectory(prefix="companion-bench-") as folder:
         config, log = Path(folder) / "daemon.toml", Path(folder) / "daemon.log"
@@ -68,18 +96,10 @@ def measure_latency(measured_s: float, *, warm_s: float) -> Latency:
             encoding="utf-8",
         )
         with log.open("wb") as stderr:
-            words = [sys.executable, "-m", "companion.bench.wire_daemon", str(config)]
+            words = [sys.executable, "-m", "companion.bench.wire_daemon", str(config), *flags]
             daemon = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=stderr)
         try:
-            seen = fly(
-                port,
-                endpoint,
-                SystemClock(),
-                rate_hz=RATE_HZ,
-                warm_s=warm_s,
-                measured_s=measured_s,
-                alive=lambda: daemon.poll() is None,
-            )
+            outcome = live(port, endpoint, daemon)
             daemon.send_signal(signal.SIGTERM)
             out, _ = daemon.communicate(timeout=10.0)
         except (TimeoutError, subprocess.TimeoutExpired) as error:
@@ -88,10 +108,7 @@ def measure_latency(measured_s: float, *, warm_s: float) -> Latency:
             if daemon.poll() is None:
                 daemon.kill()
                 daemon.communicate()
-    notes = msgspec.json.decode(out, type=Notes)
-    if "fly" not in notes.tasks:
-        raise CompanionError("bench wire: the daemon never flew")
-    return evaluate(seen, notes)
+    return outcome, msgspec.json.decode(out, type=Notes)
 
 
 def evaluate(seen: Seen, notes: Notes) -> Latency:

@@ -11,25 +11,18 @@ import json
 import math
 import resource
 import select
-import signal
-import socket
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import zenoh
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.bench.envelope import Figure
-from companion.bench.wire import free_port
+from companion.bench.wire import Daemon, beside_daemon
 from companion.bench.wire_daemon import Notes
 from companion.bench.wire_peer import Autopilot, Seen
 from companion.clock import Clock, SystemClock
-from companion.errors import CompanionError
 from companion.types import NS_PER_S
 
 RATE_HZ = 50
@@ -67,30 +60,13 @@ def measure_load(seconds: float) -> Load:
     Raises:
         CompanionError: the daemon did not come up or ended.
     """
-    port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    with tempfile.TemporaryDirectory(prefix="companion-bench-") as folder:
-        config, log = Path(folder) / "daemon.toml", Path(folder) / "daemon.log"
-        config.write_text(
-            f'[vehicle]\nprofile = "px4"\n[engage]\nby = "command"\n'
-            f'[mavlink]\nurl = "udpin://127.0.0.1:{port}"\nsystem_id = 1\n'
-            f"[zenoh]\nlisten = {json.dumps([endpoint])}\n",
-            encoding="utf-8",
-        )
-        with log.open("wb") as stderr:
-            words = [sys.executable, "-m", "companion.bench.wire_daemon", str(config), "--plain"]
-            daemon = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=stderr)
-        try:
-            world = _World(port, endpoint, SystemClock(), daemon.pid)
-            world.fly(seconds, alive=lambda: daemon.poll() is None)
-            daemon.send_signal(signal.SIGTERM)
-            out, _ = daemon.communicate(timeout=10.0)
-        except (TimeoutError, subprocess.TimeoutExpired) as error:
-            raise CompanionError(f"{error}: {log.read_text(encoding='utf-8')[-500:]}") from None
-        finally:
-            if daemon.poll() is None:
-                daemon.kill()
-                daemon.communicate()
-    notes = msgspec.json.decode(out, type=Notes)
+
+    def live(port: int, endpoint: str, daemon: Daemon) -> _World:
+        world = _World(port, endpoint, SystemClock(), daemon.pid)
+        world.fly(seconds, alive=lambda: daemon.poll() is None)
+        return world
+
+    world, notes = beside_daemon(live, "--plain")
     return world.told(seconds, notes)
 
 
