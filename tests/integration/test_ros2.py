@@ -7,7 +7,6 @@ time and publisher id. ROS itself is not here.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import socket
 import struct
@@ -18,6 +17,7 @@ from typing import Any
 import pytest
 import ros2_oracle as oracle
 import zenoh
+from datagrams import listen
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.clock import SystemClock
@@ -154,14 +154,12 @@ class Autopilot:
         self._send(self._mav.heartbeat_encode(2, 12, 1 | 128, 4 << 16 | 3 << 24, 4))
         self._send(self._mav.attitude_quaternion_encode(ms, 1.0, 0, 0, 0, 0, 0, 0))
         self._send(self._mav.local_position_ned_encode(ms, 0, 0, -2, 0, 0, 0))
-        loop = asyncio.get_running_loop()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(0.02):
-                while True:
-                    data = await loop.sock_recv(self._socket, 4096)
-                    for message in self._mav.parse_buffer(data) or []:
-                        if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                            self._send(self._mav.timesync_encode(time.monotonic_ns() - self._began_ns, message.ts1))
+        await listen(self._socket, 0.02, self._take)
+
+    def _take(self, data: bytes) -> None:
+        for message in self._mav.parse_buffer(data) or []:
+            if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                self._send(self._mav.timesync_encode(time.monotonic_ns() - self._began_ns, message.ts1))
 
 
 def test_the_daemon_tracks_what_a_node_publishes() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import socket
 from collections.abc import Awaitable, Callable
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from datagrams import listen
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from companion.clock import SystemClock
@@ -94,15 +94,13 @@ class Autopilot:
             await self.listen()
 
     async def listen(self) -> None:
-        loop = asyncio.get_running_loop()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(0.05):
-                while True:
-                    data = await loop.sock_recv(self._socket, 4096)
-                    for message in self._mav.parse_buffer(data) or []:
-                        self.received.append(message)
-                        if self.answers_time and message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                            self._send(self._mav.timesync_encode(50_000_000 * self.tick + 1, message.ts1))
+        await listen(self._socket, 0.05, self._take)
+
+    def _take(self, data: bytes) -> None:
+        for message in self._mav.parse_buffer(data) or []:
+            self.received.append(message)
+            if self.answers_time and message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                self._send(self._mav.timesync_encode(50_000_000 * self.tick + 1, message.ts1))
 
     def command(self, number: int, param1: float) -> None:
         self._send(self._mav.command_long_encode(1, 196, number, 0, param1, 0, 0, 0, 0, 0, 0))

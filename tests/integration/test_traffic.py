@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from datagrams import listen
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from traffic_scenes import adsb, distances, origin
 
@@ -43,7 +44,6 @@ class World:
             self._socket.send(message.pack(dialect.MAVLink(None, 1, component)))
 
     async def live(self, ticks: int, *messages: tuple[Any, int]) -> None:
-        loop = asyncio.get_running_loop()
         for _ in range(ticks):
             self.tick += 1
             self.send(dialect.MAVLink_heartbeat_message(2, 12, 129, 0, 4, 3))
@@ -51,11 +51,9 @@ class World:
                 self.send(message, component=component)
             self.send(dialect.MAVLink_attitude_quaternion_message(50 * self.tick, 1.0, 0, 0, 0, 0, 0, 0))
             self.send(dialect.MAVLink_local_position_ned_message(50 * self.tick, 0, 0, -2, 0, 0, 0))
-            with contextlib.suppress(TimeoutError, ConnectionRefusedError):
-                async with asyncio.timeout(0.05):
-                    while True:
-                        data = await loop.sock_recv(self._socket, 4096)
-                        self.received.extend(self._autopilot.parse_buffer(data) or [])
+            await listen(
+                self._socket, 0.05, lambda data: self.received.extend(self._autopilot.parse_buffer(data) or [])
+            )
 
     def asked_for_origin(self) -> int:
         commands = [m for m in self.received if m.get_type() == "COMMAND_LONG"]
