@@ -35,8 +35,10 @@ $(VENV)/dev.stamp: pyproject.toml constraints.txt
 demo: $(VENV)/sim.stamp  ## fly the simulated vehicle through three crossing obstacles
 	$(BIN)/companion demo
 
+# what needs no socket runs on every core, what listens to the clock runs alone
 test: $(VENV)/dev.stamp coverage  ## run the tests (without those marked slow)
-	$(BIN)/python -m pytest -m 'not slow'
+	$(BIN)/python -m pytest -n auto --dist loadfile -m 'not slow and not integration' $(addprefix --ignore-glob=*/,$(notdir $(SAFETY_TESTS) $(PILOT_TESTS)))
+	$(BIN)/python -m pytest -m 'not slow and integration'
 
 test-slow: $(VENV)/dev.stamp  ## run every test
 	$(BIN)/python -m pytest
