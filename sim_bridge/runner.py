@@ -151,7 +151,7 @@ class RealTime:
 
     def _tick(self) -> None:
         flight = self.flight
-        self._station.say(flight.control())
+        self._station.say(flight.control()[0])
         self._station.announce()
         self._publish()
         self._station.stream(*self._wires.router.links)
@@ -169,7 +169,7 @@ class RealTime:
 def due_frames(flight: Flight, t_ns: int) -> Iterator[tuple[str, bytes]]:
     """Encoded frames that have arrived by ``t_ns``, source by source."""
     for spec in flight.resolved.scenario.sensors:
-        for frame in flight.frames(spec.source, t_ns):
+        for frame in flight.crafts[0].frames(spec.source, t_ns):
             yield spec.source, encode_frame(frame, spec.sigma_m)
 
 

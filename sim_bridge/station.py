@@ -37,15 +37,19 @@ _LOCKSTEP_PINNED = frozenset({HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 
 
 class Station:
-    """What the two links see of one flight.
+    """What the two links of one vehicle see of it.
 
     Args:
+        craft: which of the flight's vehicles.
         clock_ns: the vehicle's clock now, for TIMESYNC (finer than physics steps in real time).
         lockstep: pins the heartbeat and the state messages to their default rates.
     """
 
-    def __init__(self, flight: Flight, router: Router, *, clock_ns: Callable[[], int], lockstep: bool) -> None:
+    def __init__(
+        self, flight: Flight, router: Router, *, clock_ns: Callable[[], int], lockstep: bool, craft: int = 0
+    ) -> None:
         self._flight = flight
+        self._craft = flight.crafts[craft]
         self._router = router
         self._clock_ns = clock_ns
         scenario = flight.resolved.scenario
@@ -63,7 +67,7 @@ class Station:
             return ()
         replies: tuple[Reply, ...] = ()
         if isinstance(content, LocalSetpoint):
-            replies = self._flight.autopilot.setpoint(content, self._flight.t_ns)
+            replies = self._craft.autopilot.setpoint(content, self._flight.t_ns)
         elif isinstance(content, Command):
             replies = self._command(link, content)
         elif isinstance(content, Timesync):
@@ -121,10 +125,10 @@ class Station:
         link.send(build(message_id, now, link.encoder))
 
     def _moment(self) -> Moment:
-        return Moment(self._flight.t_ns, self._flight.state, self._flight.autopilot)
+        return Moment(self._flight.t_ns, self._craft.state, self._craft.autopilot)
 
     def _status(self) -> tuple[int, bool, int]:
-        autopilot = self._flight.autopilot
+        autopilot = self._craft.autopilot
         return (int(autopilot.mode), autopilot.armed, int(autopilot.landed))
 
     def _command(self, link: Link, command: Command) -> tuple[Reply, ...]:
@@ -140,7 +144,7 @@ class Station:
             if granted:
                 self._send_one(link, message_id, self._moment())
         else:
-            return self._flight.autopilot.command(command, self._flight.state, self._flight.t_ns)
+            return self._craft.autopilot.command(command, self._craft.state, self._flight.t_ns)
         return (Ack(command.command, Result.ACCEPTED if granted else Result.DENIED, command.sender),)
 
     def _read_parameters(self, link: Link, wanted: ParamRead) -> None:
@@ -157,10 +161,10 @@ class Station:
         """The new value, or the unchanged one where it was refused, goes to everybody."""
         if wanted.name not in NAMES:
             return
-        self._flight.autopilot.parameters.write(wanted.name, wanted.value, is_int=wanted.is_int)
+        self._craft.autopilot.parameters.write(wanted.name, wanted.value, is_int=wanted.is_int)
         for link in self._router.links:
             link.send(self._param_value(link, wanted.name))
 
     def _param_value(self, link: Link, name: str) -> bytes:
-        value = self._flight.autopilot.parameters[name]
+        value = self._craft.autopilot.parameters[name]
         return link.encoder.param(name, value, NAMES.index(name), len(NAMES))
