@@ -7,12 +7,12 @@ from typing import Any
 
 import msgspec
 
-from sim_bridge.autopilot import Autopilot
 from sim_bridge.controller import Controller
 from sim_bridge.crazyflie import Quad
 from sim_bridge.judge import Judge
-from sim_bridge.messages import NS_PER_S, Mode, Reply
+from sim_bridge.messages import NS_PER_S, Reply
 from sim_bridge.obstacles import Point
+from sim_bridge.personality import Personality
 from sim_bridge.physics import BodyState, World
 from sim_bridge.scenario import End
 from sim_bridge.sensors import Frame, Sensor
@@ -40,7 +40,7 @@ class Craft:
         *,
         name: str,
         system_id: int,
-        autopilot: Autopilot,
+        autopilot: Personality,
         sensors: dict[str, Sensor],
         obstacle_ids: Sequence[str],
         others: Sequence[tuple[str, float]],
@@ -84,7 +84,7 @@ class Craft:
     @property
     def external(self) -> bool:
         """Armed and flown by setpoints from outside."""
-        return self.autopilot.mode is Mode.OFFBOARD and self.autopilot.armed
+        return self.autopilot.external and self.autopilot.armed
 
     @property
     def clearance_m(self) -> float:
@@ -104,7 +104,7 @@ class Craft:
         if judge is None:
             return
         t_ns, p_enu, clearance_m = self.t_ns, self.truth.p_enu, self.clearance_m
-        grounded = self._world.bodies[self._index].on_ground and self.autopilot.mode is Mode.OFFBOARD
+        grounded = self._world.bodies[self._index].on_ground and self.autopilot.external
         judge.step(t_ns, p_enu, clearance_m, grounded=grounded)
         if clearance_m < _NEAR_M or at_tick:
             judge.approach(t_ns, p_enu, self._surroundings())
@@ -165,7 +165,7 @@ class Craft:
         """Truth at this instant, for pictures."""
         return {
             "offboard_s": None if self.judge is None else (self.t_ns - self.judge.start_ns) / NS_PER_S,
-            "mode": self.autopilot.mode.name,
+            "mode": self.autopilot.mode_name,
             "position": self.truth.p_enu,
             "velocity": self.truth.v_enu,
             "clearance_m": self.clearance_m if self._ids else None,

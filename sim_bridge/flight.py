@@ -39,7 +39,13 @@ class Flight:
     def _craft(self, index: int) -> Craft:
         scenario, world = self.resolved.scenario, self.world
         spec, model = scenario.vehicle, world.vehicles[index]
-        autopilot = Autopilot(start_enu=spec.start, rest_height_m=model.radius_m, yaw_rad=spec.yaw_rad)
+        autopilot = Autopilot(
+            start_enu=spec.start,
+            rest_height_m=model.radius_m,
+            yaw_rad=spec.yaw_rad,
+            control_hz=scenario.control_hz,
+            physics_hz=scenario.physics_hz,
+        )
         autopilot.parameters.write("MIS_TAKEOFF_ALT", spec.takeoff_altitude_m, is_int=False)
         ids = [o.id for o in self.resolved.obstacles]
         return Craft(
