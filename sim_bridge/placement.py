@@ -38,6 +38,10 @@ class Resolved:
         obstacles' jitter, of other sensors and of other vehicles."""
         return np.random.default_rng([self.seed, 1, index, vehicle] if vehicle else [self.seed, 1, index])
 
+    def physics_rng(self, effect: int, vehicle: int) -> np.random.Generator:
+        """The generator of a random effect of the physics (0 gusts, 1 estimator) on vehicle ``vehicle``."""
+        return np.random.default_rng([self.seed, 2, effect, vehicle])
+
 
 def resolve(name: str, scenario: Scenario, seed: int, *, obstacles: bool = True) -> Resolved:
     """The concrete flight of ``seed``; ``obstacles`` false leaves them out (the sensors then send empty frames)."""
