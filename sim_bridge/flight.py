@@ -10,7 +10,7 @@ from sim_bridge.crazyflie import Crazyflie
 from sim_bridge.messages import NS_PER_S, Reply
 from sim_bridge.physics import Start, World
 from sim_bridge.placement import Resolved
-from sim_bridge.sensors import Sensor
+from sim_bridge.sensors import Sensor, sensor_of
 
 
 class Flight:
@@ -63,16 +63,7 @@ class Flight:
 
     def _sensors(self, ids: list[str], radii_m: tuple[float, ...]) -> dict[str, Sensor]:
         return {
-            spec.source: Sensor(
-                ids,
-                radii_m,
-                rate_hz=spec.rate_hz,
-                sigma_m=spec.sigma_m,
-                latency_s=spec.latency_s,
-                dropout=spec.dropout,
-                frame_dropout=spec.frame_dropout,
-                rng=self.resolved.sensor_rng(index),
-            )
+            spec.source: sensor_of(spec, ids, radii_m, self.resolved.sensor_rng(index))
             for index, spec in enumerate(self.resolved.scenario.sensors)
         }
 
