@@ -11,7 +11,6 @@ What hits what (``on``), and what ``value`` means:
     gust                                the world: an added wind, value [east, north, up] m/s
     battery                             the autopilot: value is the state of charge from now on, 0..1
     rc                                  the autopilot: the pilot takes over, value is the mode (default POSITION)
-    gps                                 the autopilot has no position
 
 A link is ``onboard`` (the daemon's) or ``ground``; a source is its name, or ``obstacles`` for all of them.
 """
@@ -38,7 +37,6 @@ What: TypeAlias = Literal[
     "gust",
     "battery",
     "rc",
-    "gps",
 ]
 DaemonState: TypeAlias = Literal["WAITING", "READY", "ACTIVE", "HOLD", "OVERRIDDEN", "FAULT"]
 Verdict: TypeAlias = Literal["nominal", "adjusted", "relaxed", "braking", "silent"]
@@ -56,7 +54,6 @@ _PLACES: dict[str, tuple[str, ...]] = {
     "gust": ("world",),
     "battery": ("autopilot",),
     "rc": ("autopilot",),
-    "gps": ("autopilot",),
 }
 _VALUES: dict[str, str] = {
     "delay": "a delay above 0 s",
