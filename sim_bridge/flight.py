@@ -10,7 +10,8 @@ from sim_bridge.autopilot import Autopilot
 from sim_bridge.controller import Controller
 from sim_bridge.crazyflie import Crazyflie
 from sim_bridge.judge import Judge
-from sim_bridge.messages import NS_PER_S, Mode, Reply
+from sim_bridge.messages import NS_PER_S, Reply
+from sim_bridge.personality import Personality
 from sim_bridge.physics import BodyState, World
 from sim_bridge.placement import Resolved
 from sim_bridge.sensors import Frame, Sensor
@@ -35,7 +36,13 @@ class Flight:
             start_enu=scenario.vehicle.start,
             start_yaw_rad=yaw_rad,
         )
-        self.autopilot = Autopilot(start_enu=scenario.vehicle.start, rest_height_m=vehicle.radius_m, yaw_rad=yaw_rad)
+        self.autopilot: Personality = Autopilot(
+            start_enu=scenario.vehicle.start,
+            rest_height_m=vehicle.radius_m,
+            yaw_rad=yaw_rad,
+            control_hz=scenario.control_hz,
+            physics_hz=scenario.physics_hz,
+        )
         self.autopilot.parameters.write("MIS_TAKEOFF_ALT", scenario.vehicle.takeoff_altitude_m, is_int=False)
         self.judge: Judge | None = None
         self._controller = Controller(vehicle, scenario.physics_hz)
@@ -71,15 +78,15 @@ class Flight:
         return self.world.step_count % self.resolved.control_steps == 0
 
     def advance(self) -> None:
-        """One physics step under the autopilot's present target; the obstacles start with offboard."""
+        """One physics step under the autopilot's present target; the obstacles start with external control."""
         world, autopilot = self.world, self.autopilot
-        if self.judge is None and autopilot.mode is Mode.OFFBOARD and autopilot.armed:
+        if self.judge is None and autopilot.external and autopilot.armed:
             self._start()
         world.step(self._controller.rpm(world.state, autopilot.target(world.state)))
         autopilot.turn(self._dt_s)
         self._sense()
         if self.judge is not None:
-            grounded = world.on_ground and autopilot.mode is Mode.OFFBOARD
+            grounded = world.on_ground and autopilot.external
             self.judge.step(self.t_ns, world.state.p_enu, world.clearance_m, grounded=grounded)
             if world.clearance_m < _NEAR_M or self.at_tick:
                 self.judge.approach(self.t_ns, world.state.p_enu, world.obstacles_enu)
@@ -123,7 +130,7 @@ class Flight:
         return {
             "t_ns": self.t_ns,
             "offboard_s": None if judge is None else (self.t_ns - judge.start_ns) / NS_PER_S,
-            "mode": self.autopilot.mode.name,
+            "mode": self.autopilot.mode_name,
             "position": world.state.p_enu,
             "velocity": world.state.v_enu,
             "obstacles": world.obstacles_enu,

@@ -19,7 +19,7 @@ from sim_bridge.flight import Flight
 from sim_bridge.links import Link
 from sim_bridge.lockstep import COMPANION, Answer, Desk, LockstepStalled, Offer
 from sim_bridge.mavlink import Packet
-from sim_bridge.messages import NS_PER_S, Ack, Command, Mode
+from sim_bridge.messages import NS_PER_S, Ack, Command
 from sim_bridge.runner import Trace, Wires, due_frames, outcome
 from sim_bridge.scenario import OperatorStep
 from sim_bridge.station import Station
@@ -47,7 +47,9 @@ class Lockstep:
         self._trace = trace
         self._progress = progress
         self._desk = Desk(flight.resolved.scenario.operator)
-        self._station = Station(flight, wires.router, clock_ns=lambda: flight.t_ns, lockstep=True)
+        self._station = Station(
+            flight, wires.router, t_ns=lambda: flight.t_ns, clock_ns=lambda: flight.t_ns, lockstep=True
+        )
         self._answer = Answer(-1, wires.bridge.record_key)
         self._obstacles_ns = -1  # tick up to which frames and markers have left
         # what every sensor will hand out at the next tick is measured already: it leaves before the physics
@@ -142,7 +144,7 @@ class Lockstep:
         flight = self.flight
         if self._foresees:
             self._send_obstacles(flight.t_ns + flight.resolved.period_ns)
-        if self._offboard_wall is None and flight.autopilot.mode is Mode.OFFBOARD:
+        if self._offboard_wall is None and flight.autopilot.external:
             self._offboard_wall = time.perf_counter()
         for _ in range(flight.resolved.control_steps):
             flight.advance()

@@ -104,7 +104,7 @@ class RealTime:
         self._late_ns = 0
         self._stopped = False
         self._ends = flight.resolved.scenario.end.stop and not stay
-        self._station = Station(flight, wires.router, clock_ns=self._clock_ns, lockstep=False)
+        self._station = Station(flight, wires.router, t_ns=lambda: flight.t_ns, clock_ns=self._clock_ns, lockstep=False)
 
     def stop(self) -> None:
         self._stopped = True
