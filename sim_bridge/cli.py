@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -51,6 +52,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_scenario(run)
     run.add_argument("--lockstep", action="store_true", help="wait for the companion at each tick, not for the clock")
+    run.add_argument(
+        "--speed",
+        type=_speed,
+        default=1.0,
+        metavar="F",
+        help="vehicle time over wall time, 0.01 to 100 (default 1); what the machine cannot keep is late_s",
+    )
     run.add_argument("--stay", action="store_true", help="fly on after the end of the flight, until a signal")
     run.add_argument("--onboard-port", type=_port, default=14540, help="UDP port of the companion (default 14540)")
     run.add_argument("--gcs-port", type=_port, default=14550, help="UDP port of the ground station (default 14550)")
@@ -91,6 +99,16 @@ def _port(text: str) -> int:
     return int(text)
 
 
+def _speed(text: str) -> float:
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = math.nan
+    if not 0.01 <= speed <= 100.0:
+        raise argparse.ArgumentTypeError(f"expected a factor, 0.01 to 100, got {text}")
+    return speed
+
+
 def _seed(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"expected a whole number, 0 or above, got {text}")
@@ -118,6 +136,8 @@ def _run(arguments: argparse.Namespace) -> int:
     endpoint = None if arguments.zenoh_listen == _NO_ZENOH else arguments.zenoh_listen
     if arguments.lockstep and endpoint is None:
         raise ScenarioError("--zenoh-listen none: expected an endpoint with --lockstep")
+    if arguments.lockstep and arguments.speed != 1.0:
+        raise ScenarioError("--speed: expected none with --lockstep, which runs as fast as it can")
     if arguments.onboard_port == arguments.gcs_port:
         raise ScenarioError(f"--gcs-port {arguments.gcs_port}: expected another port than --onboard-port")
     with ExitStack() as stack:
@@ -133,8 +153,13 @@ def _run(arguments: argparse.Namespace) -> int:
         stack.callback(wires.close)
         flight = Flight(resolved)
         stack.callback(flight.close)
-        kind = Lockstep if arguments.lockstep else RealTime
-        runner = kind(flight, wires, trace=trace, progress=_progress(), stay=arguments.stay)
+        runner: Lockstep | RealTime
+        if arguments.lockstep:
+            runner = Lockstep(flight, wires, trace=trace, progress=_progress(), stay=arguments.stay)
+        else:
+            runner = RealTime(
+                flight, wires, trace=trace, progress=_progress(), stay=arguments.stay, speed=arguments.speed
+            )
         with _stopped_by_signals(runner.stop):
             summary = runner.run()
     _report(summary, as_json=arguments.json)

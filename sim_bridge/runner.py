@@ -22,7 +22,7 @@ from sim_bridge.placement import Resolved
 from sim_bridge.station import Station
 from sim_bridge.zenoh_io import Bridge, encode_frame
 
-_LATE_NS = NS_PER_S // 4  # further behind the clock than this, time is given up instead of caught up
+_LATE_NS = NS_PER_S // 4  # of wall time: further behind the clock than this, time is given up, not caught up
 
 
 class Wires:
@@ -91,12 +91,21 @@ class RealTime:
     Args:
         progress: called at every control period with the flight.
         stay: fly on after the scenario's end.
+        speed: vehicle time over wall time, as PX4's PX4_SIM_SPEED_FACTOR; every clock of the vehicle runs as fast.
     """
 
     def __init__(
-        self, flight: Flight, wires: Wires, *, trace: Trace, progress: Callable[[Flight], None], stay: bool = False
+        self,
+        flight: Flight,
+        wires: Wires,
+        *,
+        trace: Trace,
+        progress: Callable[[Flight], None],
+        stay: bool = False,
+        speed: float = 1.0,
     ) -> None:
         self.flight = flight
+        self._speed = speed
         self._wires = wires
         self._trace = trace
         self._progress = progress
@@ -121,12 +130,13 @@ class RealTime:
             due_ns = (flight.world.step_count + 1) * NS_PER_S // flight.world.physics_hz
             behind_ns = self._clock_ns() - due_ns
             if behind_ns < 0:
-                if wires.wait(-behind_ns / NS_PER_S):
+                if wires.wait(-behind_ns / self._speed / NS_PER_S):
                     self._receive()
                 continue
-            if behind_ns > _LATE_NS:
-                self._late_ns += behind_ns
-                self._epoch_ns += behind_ns
+            late_ns = round(behind_ns / self._speed)  # of wall time
+            if late_ns > _LATE_NS:
+                self._late_ns += late_ns
+                self._epoch_ns += late_ns
             self._receive()
             self._step()
             if self._ends and flight.ended is not None:
@@ -135,7 +145,8 @@ class RealTime:
         return {**outcome(flight), "wall_s": wall_s, "late_s": self._late_ns / NS_PER_S}
 
     def _clock_ns(self) -> int:
-        return time.monotonic_ns() - self._epoch_ns
+        """The vehicle's clock now."""
+        return round((time.monotonic_ns() - self._epoch_ns) * self._speed)
 
     def _receive(self) -> None:
         for link, packet in self._wires.router.receive():
