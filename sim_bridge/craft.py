@@ -131,7 +131,7 @@ class Craft:
         t_ns = self.t_ns
         for sensor in self.sensors.values():
             if t_ns >= sensor.next_ns:
-                sensor.sample(t_ns, self._surroundings())
+                sensor.sample(t_ns, self._surroundings(), self.truth)
 
     def control(self) -> tuple[Reply, ...]:
         """The autopilot's look at the clock, once a control period."""

@@ -29,6 +29,7 @@ from sim_bridge.wires import CraftWires, Feed, damage_frame
 
 T = TypeVar("T")
 
+_FOREVER_S = 1e6
 _FAULT_DRAWS = 2  # what these generators are for, beside the obstacles' jitter (0) and the sensors (1)
 
 
@@ -273,8 +274,7 @@ class Faults:
     def _hit_world(self, hit: Hit) -> None:
         world, value = self._flight.world, hit.fault.value
         if isinstance(value, tuple):
-            world.gust = value
-            hit.undo.append(lambda: setattr(world, "gust", (0.0, 0.0, 0.0)))
+            world.gust(value, _FOREVER_S if hit.fault.for_s is None else hit.fault.for_s)
 
     # --- clocks
 
