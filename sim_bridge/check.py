@@ -121,6 +121,7 @@ class _Flown:
     ) -> None:
         self._daemons = daemons
         self._progress = progress
+        self._lag_ns = resolved.period_ns if lockstep else 0
         wires = self._wires = Wires(resolved, onboard_port=0, ground_port=0, endpoint=endpoint, lockstep=lockstep)
         stack.callback(wires.close)
         flight = self._flight = Flight(resolved)
@@ -148,7 +149,8 @@ class _Flown:
         return CheckResult((*findings, *failures), summary, ended)
 
     def _tick(self, flight: Flight) -> None:
-        self._watch.tick(flight)
+        # lockstep reports after the physics, real time before it
+        self._watch.tick(flight.t_ns - self._lag_ns)
         self._progress(flight)
         if flight.t_ns > GIVE_UP_S * NS_PER_S and all(craft.judge is None for craft in flight.crafts):
             self.runner.stop()

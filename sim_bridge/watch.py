@@ -85,10 +85,10 @@ class Watch:
             del self._chunks[vehicle, message.id]
         self._note_text(vehicle, text)
 
-    def tick(self, flight: Flight) -> None:
-        """The autopilots' modes after one control period."""
-        for seen, craft in zip(self.seen, flight.crafts, strict=True):
-            Seen.extend(seen.modes, craft.autopilot.mode_name, flight.t_ns)
+    def tick(self, t_ns: int) -> None:
+        """The autopilots' modes, in force since the tick of ``t_ns``."""
+        for seen, craft in zip(self.seen, self._flight.crafts, strict=True):
+            Seen.extend(seen.modes, craft.autopilot.mode_name, t_ns)
 
     def _said(self, vehicle: int, text: Text) -> None:
         self._note_text(vehicle, text.text)
