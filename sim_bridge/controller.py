@@ -87,6 +87,10 @@ class Controller:
         self.gains = Gains() if gains is None else gains
         self._rate_hz = float(physics_hz)
         self._tilt_tan = math.tan(self.gains.tilt_max_rad)
+        # the vehicle's derived figures, once: these loops run every physics step
+        self._weight_n = vehicle.weight_n
+        self._least_n, self._most_n = vehicle.idle_thrust_n, vehicle.k_f * vehicle.max_rpm**2
+        self._lever_m = 4.0 * vehicle.arm_m / math.sqrt(2.0)
         self._thrust_scale = 1.0 + hover_thrust_error
         self._last_omega: Triple | None = None
         self._integral: Triple = (0.0, 0.0, 0.0)
@@ -135,10 +139,10 @@ class Controller:
 
     def _thrust_vector(self, a_enu: Triple) -> Triple:
         """m (a + g e3), its vertical part within the collective's range, its horizontal part within the tilt limit."""
-        vehicle, gains = self.vehicle, self.gains
-        fx, fy, fz = vehicle.mass_kg * a_enu[0], vehicle.mass_kg * a_enu[1], vehicle.mass_kg * a_enu[2]
-        fz += vehicle.weight_n
-        fz = min(max(fz, gains.least_collective * vehicle.weight_n), gains.most_collective * vehicle.weight_n)
+        mass_kg, weight_n, gains = self.vehicle.mass_kg, self._weight_n, self.gains
+        fx, fy, fz = mass_kg * a_enu[0], mass_kg * a_enu[1], mass_kg * a_enu[2]
+        fz += weight_n
+        fz = min(max(fz, gains.least_collective * weight_n), gains.most_collective * weight_n)
         level, level_max = math.hypot(fx, fy), fz * self._tilt_tan
         if level > level_max:
             fx, fy = fx * level_max / level, fy * level_max / level
@@ -187,9 +191,7 @@ class Controller:
         Inverse of: sum f = collective, sum y f = tau_x, -sum x f = tau_y, sum c (k_m / k_f) f = tau_z. Where one
         motor cannot, roll and pitch come first, then the collective, then yaw.
         """
-        vehicle = self.vehicle
-        least, most = vehicle.idle_thrust_n, vehicle.k_f * vehicle.max_rpm**2
-        lever = 4.0 * vehicle.arm_m / math.sqrt(2.0)
+        vehicle, least, most, lever = self.vehicle, self._least_n, self._most_n, self._lever_m
         roll, pitch = torque_flu[0] / lever, torque_flu[1] / lever
         tilting = (roll - pitch, roll + pitch, -roll + pitch, -roll - pitch)
         span = 2.0 * max(tilting)  # the four come in pairs of opposite sign
@@ -201,7 +203,8 @@ class Controller:
         yaw = torque_flu[2] * vehicle.k_f / (4.0 * vehicle.k_m)
         for turn, sign in zip(tilting, SPIN_TORQUE_SIGN, strict=True):
             room = most - share - turn if sign * yaw > 0.0 else share + turn - least
-            yaw = math.copysign(min(abs(yaw), max(room, 0.0)), yaw)
+            if abs(yaw) > room:
+                yaw = math.copysign(max(room, 0.0), yaw)
         f0, f1, f2, f3 = (share + turn + sign * yaw for turn, sign in zip(tilting, SPIN_TORQUE_SIGN, strict=True))
         k_f = vehicle.k_f
         return (math.sqrt(f0 / k_f), math.sqrt(f1 / k_f), math.sqrt(f2 / k_f), math.sqrt(f3 / k_f))
