@@ -217,7 +217,7 @@ class Faults:
                 hit.undo.append(partial(_shift, feed, -_value_ns(hit.fault)))
                 continue
             assert feed.channel is not None, "opened when the flight began"
-            self._impair(hit, feed.channel, way, damage_frame, repeat=feed.again)
+            self._impair(hit, feed.channel, way, damage_frame)
 
     def _impair(
         self,
@@ -225,7 +225,6 @@ class Faults:
         channel: Channel[T],
         way: int,
         damage: Callable[[T, np.random.Generator], T],
-        repeat: Callable[[T, T], T] | None = None,
     ) -> None:
         fault = hit.fault
         timed_rng, wall_rng = (
@@ -239,7 +238,6 @@ class Faults:
             rng=timed_rng,
             wall_rng=wall_rng,
             damage=damage,
-            repeat=repeat,
         )
         channel.impairments.append(impairment)
         hit.undo.append(lambda: channel.remove(impairment))
