@@ -22,7 +22,7 @@ from sim_bridge.errors import ScenarioError
 from sim_bridge.flight import Flight
 from sim_bridge.impairments import Channel, Impairment, damage_message
 from sim_bridge.messages import FORCE_DISARM, NS_PER_S, Cmd, Command, Reply, Sender
-from sim_bridge.pilot import Pilot
+from sim_bridge.pilot import Pilot, switch_command
 from sim_bridge.scenario_faults import LINKS, Fault
 from sim_bridge.station import Station
 from sim_bridge.wires import CraftWires, Feed, damage_frame
@@ -44,6 +44,9 @@ class Process(Protocol):
 
     def kill(self) -> None:
         """SIGKILL."""
+
+    def check_alive(self) -> None:
+        """Raise SimError where it has ended by itself."""
 
 
 @dataclass(slots=True)
@@ -105,6 +108,7 @@ class Faults:
         self._stations = stations
         started = processes or {}
         self.companions = tuple(Companion(started.get(craft.vehicle.name)) for craft in wires)
+        self._processes = tuple(started.values())
         self.hits = tuple(self._planned())
         self._pilots: dict[int, Pilot] = {}
         for hit in self.hits:
@@ -117,6 +121,11 @@ class Faults:
             hit.craft == craft and (hit.fault.on == "onboard" or hit.fault.what in ("freeze", "clock_jump"))
             for hit in self.hits
         )
+
+    def check_daemons(self) -> None:
+        """Raise SimError where a daemon that this process has started has ended by itself."""
+        for process in self._processes:
+            process.check_alive()
 
     def step(self) -> None:
         """Start and end what is due now; once at the beginning of every control period."""
@@ -146,6 +155,8 @@ class Faults:
     def _check(self, hit: Hit) -> None:
         if hit.fault.on == "daemon" and self.companions[hit.craft].process is None:
             raise ScenarioError(f"faults[{hit.index}]: expected --check, which starts the daemon, for {hit.fault.what}")
+        if hit.fault.what == "rc":
+            switch_command(self._flight.crafts[hit.craft], _mode_of(hit.fault))  # raises for a mode that is none
 
     def _open_channels(self, hit: Hit) -> None:
         """Channels stand for the whole flight, so that how messages leave does not change when a fault begins."""
@@ -259,8 +270,7 @@ class Faults:
 
     def _take_over(self, hit: Hit) -> None:
         pilot = self._pilots.setdefault(hit.craft, Pilot(self._flight.crafts[hit.craft]))
-        mode = hit.fault.value
-        self._say(hit.craft, pilot.take_over(mode if isinstance(mode, str) else None, self._flight.t_ns))
+        self._say(hit.craft, pilot.take_over(_mode_of(hit.fault), self._flight.t_ns))
         hit.undo.append(pilot.let_go)
 
     def _hit_sensors(self, hit: Hit, craft: Craft) -> None:
@@ -290,6 +300,10 @@ class Faults:
 
 def _value_ns(fault: Fault) -> int:
     return round(fault.value * NS_PER_S) if isinstance(fault.value, float) else 0
+
+
+def _mode_of(fault: Fault) -> str | None:
+    return fault.value if isinstance(fault.value, str) else None
 
 
 def _shift(feed: Feed, by_ns: int) -> None:

@@ -219,6 +219,7 @@ class Lockstep:
             now = time.monotonic()
             if now >= deadline:
                 raise LockstepStalled(f"lockstep: after {limit_s:g} s: {missing()} (held at {self.flight.t_ns} ns)")
+            self.faults.check_daemons()
             self._stay_alive(now)
             self._wires.wait(_POLL_S)
             self._receive()

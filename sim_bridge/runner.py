@@ -154,6 +154,7 @@ class RealTime:
 
     def _tick(self) -> None:
         flight = self.flight
+        self.faults.check_daemons()
         self.faults.step()
         if self._operator is not None:
             self._operator.tick(flight.t_ns)
