@@ -17,8 +17,8 @@ from sim_bridge.physics import BodyState
 from sim_bridge.shaping import Goal, Limits, Reference, shortened
 
 _KP_XY, _KV_XY = 1.0, 2.0  # [1/s]
-_KP_Z, _KV_Z = 1.0, 2.0
-_LAG_Z_S = 0.11
+_KP_Z, _KV_Z = 1.0, 1.5  # [1/s]
+_LAG_Z_S = 0.2
 _LEASH_M, _LEASH_M_S = 2.0, 3.0  # the reference does not run further ahead of a vehicle that cannot follow
 _G_M_S2 = 9.81
 

@@ -173,7 +173,9 @@ def _submode(uses_p: bool, uses_v: bool, uses_a: bool) -> Submode | None:
 
 
 def _finite(setpoint: LocalSetpoint, uses_p: bool, uses_v: bool, uses_a: bool) -> bool:
-    used = [x for use, v in ((uses_p, setpoint.p_enu), (uses_v, setpoint.v_enu), (uses_a, setpoint.a_enu)) if use for x in v]
+    used = [
+        x for use, v in ((uses_p, setpoint.p_enu), (uses_v, setpoint.v_enu), (uses_a, setpoint.a_enu)) if use for x in v
+    ]
     if not setpoint.type_mask & _YAW:
         used.append(setpoint.yaw_rad)
     if not setpoint.type_mask & _YAW_RATE:

@@ -78,8 +78,8 @@ class ArduParameters:
     def is_int(self, name: str) -> bool:
         return DEFINITIONS[name].kind != REAL32
 
-    def kind(self, name: str) -> int:
-        """MAV_PARAM_TYPE."""
+    def cast_to(self, name: str) -> int:
+        """MAV_PARAM_TYPE; the value travels as a plain float."""
         return DEFINITIONS[name].kind
 
     def write(self, name: str, value: float | int, *, is_int: bool) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from sim_bridge.ardupilot import ArduCopter
 from sim_bridge.autopilot import Autopilot
 from sim_bridge.craft import Craft
 from sim_bridge.crazyflie import Crazyflie
@@ -11,6 +12,8 @@ from sim_bridge.messages import NS_PER_S, Reply
 from sim_bridge.physics import Start, World
 from sim_bridge.placement import Resolved
 from sim_bridge.sensors import Sensor
+
+AUTOPILOTS: dict[str, type[Autopilot] | type[ArduCopter]] = {"px4": Autopilot, "ardupilot": ArduCopter}
 
 
 class Flight:
@@ -39,14 +42,15 @@ class Flight:
     def _craft(self, index: int) -> Craft:
         scenario, world = self.resolved.scenario, self.world
         spec, model = scenario.vehicle, world.vehicles[index]
-        autopilot = Autopilot(
+        autopilot = AUTOPILOTS[spec.personality](
             start_enu=spec.start,
             rest_height_m=model.radius_m,
             yaw_rad=spec.yaw_rad,
             control_hz=scenario.control_hz,
             physics_hz=scenario.physics_hz,
         )
-        autopilot.parameters.write("MIS_TAKEOFF_ALT", spec.takeoff_altitude_m, is_int=False)
+        if spec.personality == "px4":
+            autopilot.parameters.write("MIS_TAKEOFF_ALT", spec.takeoff_altitude_m, is_int=False)
         ids = [o.id for o in self.resolved.obstacles]
         return Craft(
             world,
