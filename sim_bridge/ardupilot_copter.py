@@ -132,7 +132,7 @@ class Copter:
             case ArduMode.GUIDED:
                 return plans.guided(self.guided, self.t_ns)
             case ArduMode.BRAKE:
-                return plans.brake()
+                return plans.stop()
             case ArduMode.RTL if self._return is not None:
                 return plans.back(self._return, above_m)
             case ArduMode.LAND:

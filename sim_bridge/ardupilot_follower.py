@@ -2,9 +2,9 @@
 
     a = a_ref + k_v (v_ref + k_p (p_ref - p) - v), its vertical part through a first-order lag
 
-The reference is `shaping`'s. k_p and k_v are ArduCopter's defaults (PSC_POSXY_P, PSC_VELXY_P, PSC_POSZ_P, the vertical
-velocity gain softened for the lag). The vehicle's own attitude and motor lag follows; the vertical lag here stands for
-ArduCopter's acceleration loop and its filters, so that steps answer as measured.
+The reference is `shaping`'s. The level gains are ArduCopter's defaults (PSC_POSXY_P, PSC_VELXY_P), the vertical ones
+softened for the lag. The vehicle's own attitude and motor lag follows; the vertical lag here stands for ArduCopter's
+acceleration loop and its filters, so that steps answer as measured.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sim_bridge.physics import BodyState
 from sim_bridge.shaping import Goal, Limits, Reference, shortened
 
 _KP_XY, _KV_XY = 1.0, 2.0  # [1/s]
-_KP_Z, _KV_Z = 1.0, 1.5  # [1/s]
+_KP_Z, _KV_Z = 0.5, 1.5
 _LAG_Z_S = 0.2
 _LEASH_M, _LEASH_M_S = 2.0, 3.0  # the reference does not run further ahead of a vehicle that cannot follow
 _G_M_S2 = 9.81

@@ -32,7 +32,6 @@ DEFINITIONS: dict[str, Definition] = {
     "BATT_LOW_MAH": Definition(0.0, REAL32),
     "BATT_LOW_TIMER": Definition(10, INT8),  # voltage low for this long [s]
     "BATT_LOW_VOLT": Definition(0.0, REAL32),  # ArduPilot's default is 10.5 V, three cells
-    "BRAKE_DECEL": Definition(750.0, REAL32),  # of BRAKE [cm/s^2]; a constant of ArduCopter's source
     "DISARM_DELAY": Definition(10, INT8),  # armed on the ground for this long [s], 0: never
     "FENCE_ACTION": Definition(1, INT8),  # 0 report, 1 RTL or land, 2 land, 3 RTL, 4 brake or land
     "FENCE_ALT_MAX": Definition(100.0, REAL32),  # above home [m]

@@ -105,15 +105,9 @@ class Plans:
             holds_velocity=not (opens and options & _VELOCITY_FREE),
         )
 
-    def stop(self, decel_m_s2: float | None = None) -> Plan:
-        """Brake to a stop and stay."""
-        level = self._level_limits()
-        if decel_m_s2 is not None:
-            level = Limits(level.speed_m_s, decel_m_s2, level.jerk_m_s3)
-        return Plan(Goal(_STILL2, _STILL2), level, Goal(_STILL1, _STILL1), self._up_limits())
-
-    def brake(self) -> Plan:
-        return self.stop(self._parameters.positive("BRAKE_DECEL") * 0.01)
+    def stop(self) -> Plan:
+        """Brake to a stop and stay: BRAKE, and GUIDED without a target."""
+        return Plan(Goal(_STILL2, _STILL2), self._level_limits(), Goal(_STILL1, _STILL1), self._up_limits())
 
     def land(self, above_home_m: float) -> Plan:
         """Stop over the place and sink, slowly below 10 m."""
