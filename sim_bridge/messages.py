@@ -6,7 +6,7 @@ Numbers are those of MAVLink's common dialect (MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from typing import TypeAlias
 
@@ -97,7 +97,7 @@ class Command:
     sender: Sender
     target_system: int = 1
     target_component: int = 1
-    custom_mode: int | None = None  # SET_MODE's
+    custom_mode: int | None = field(default=None, compare=False)  # SET_MODE's, of which params hold PX4's parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +167,7 @@ class ParamWrite:
     name: str
     value: float | int
     is_int: bool
-    cast: float = math.nan  # the float field as it stands: the value where integers travel as floats (C_CAST)
+    cast: float = field(default=math.nan, compare=False)  # as a plain float: the value under C_CAST
 
 
 @dataclass(frozen=True, slots=True)
