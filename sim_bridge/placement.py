@@ -38,6 +38,10 @@ class Resolved:
         obstacles' jitter, of other sensors and of other vehicles."""
         return np.random.default_rng([self.seed, 1, index, vehicle] if vehicle else [self.seed, 1, index])
 
+    def physics_rng(self, effect: int, vehicle: int) -> np.random.Generator:
+        """The generator of a random effect of the physics (0 gusts, 1 estimator) on vehicle ``vehicle``."""
+        return np.random.default_rng([self.seed, 2, effect, vehicle])
+
 
 def resolve(name: str, scenario: Scenario, seed: int, *, obstacles: bool = True) -> Resolved:
     """The concrete flight of ``seed``; ``obstacles`` false leaves them out (the sensors then send empty frames)."""
@@ -47,14 +51,14 @@ def resolve(name: str, scenario: Scenario, seed: int, *, obstacles: bool = True)
     return Resolved(name=name, seed=seed, scenario=scenario, obstacles=placed if obstacles else ())
 
 
-def describe(resolved: Resolved, vehicle_name: str) -> dict[str, Any]:
+def describe(resolved: Resolved, vehicle_name: str | None = None) -> dict[str, Any]:
     """What `sim-bridge scenario --json` prints: all that the other side of the wires has to know."""
     scenario = resolved.scenario
     described: dict[str, Any] = msgspec.to_builtins(scenario)
     described |= {
         "name": resolved.name,
         "seed": resolved.seed,
-        "prefix": f"uav/{vehicle_name}",
+        "prefix": f"uav/{vehicle_name or scenario.vehicle.name}",
         "fleet": [_described(scenario, vehicle) for vehicle in scenario.fleet],
         "start": scenario.vehicle.start,
         "takeoff_altitude_m": scenario.vehicle.takeoff_altitude_m,

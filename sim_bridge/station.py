@@ -76,6 +76,8 @@ class Station:
         self._autopilot.lockstep = lockstep
         self._boot_ns = self._autopilot.up_since_ns
         self._streams = self._fresh_streams()
+        self.clock_offset_ns = 0  # by which the vehicle's clock has jumped (faults)
+        self.on_text: Callable[[Text], None] = lambda text: None
         self._announced = self._status()
 
     def _fresh_streams(self) -> dict[Link, Streams]:
@@ -116,7 +118,7 @@ class Station:
         elif isinstance(content, Command):
             replies = self._command(link, content)
         elif isinstance(content, Timesync):
-            link.send(link.encoder.timesync(content, self._clock_ns() - self._boot_ns))
+            link.send(link.encoder.timesync(content, max(0, self._clock_ns() + self.clock_offset_ns - self._boot_ns)))
         elif isinstance(content, StreamRequest):
             for message_id in self._autopilot.stream_group(content.stream):
                 interval_us = 1e6 / content.rate_hz if content.rate_hz else -1.0
@@ -133,6 +135,7 @@ class Station:
         """Acknowledgements on ``link``, texts on both."""
         for reply in replies:
             if isinstance(reply, Text):
+                self.on_text(reply)
                 for each in self._router.links:
                     each.send(each.encoder.text(reply))
             elif link is not None:
@@ -166,7 +169,7 @@ class Station:
         """Messages off their schedule, while time is held."""
         now = self._moment()
         for message_id in message_ids:
-            self._send_one(link, message_id, now)
+            self._send_one(link, message_id, now, timed=False)
 
     def send(self, message_id: int) -> None:
         """One message now, on both links."""
@@ -174,11 +177,16 @@ class Station:
         for link in self._router.links:
             self._send_one(link, message_id, now)
 
-    def _send_one(self, link: Link, message_id: int, now: Moment) -> None:
-        link.send(build(message_id, now, link.encoder))
+    def _send_one(self, link: Link, message_id: int, now: Moment, *, timed: bool = True) -> None:
+        link.send(build(message_id, now, link.encoder), timed=timed)
 
     def _moment(self) -> Moment:
-        return Moment(self._t_ns() - self._boot_ns, self._vehicle.state, self._autopilot, self._router.id.system)
+        return Moment(
+            max(0, self._t_ns() + self.clock_offset_ns - self._boot_ns),
+            self._vehicle.state,
+            self._autopilot,
+            self._router.id.system,
+        )
 
     def _status(self) -> tuple[int, bool, int]:
         autopilot = self._autopilot
