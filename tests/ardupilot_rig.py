@@ -70,8 +70,18 @@ def texts(replies: tuple[Reply, ...]) -> list[str]:
 class Rig:
     """One flight; ``said`` are the STATUSTEXTs of its control periods."""
 
-    def __init__(self, start: Vec3 = (0.0, 0.0, 20.0), *, yaw_deg: float = 0.0, **parameters: float) -> None:
+    def __init__(
+        self,
+        start: Vec3 = (0.0, 0.0, 20.0),
+        *,
+        yaw_deg: float = 0.0,
+        physics_hz: int = 240,
+        control_hz: int = 20,
+        **parameters: float,
+    ) -> None:
         raw: dict[str, Any] = {
+            "physics_hz": physics_hz,
+            "control_hz": control_hz,
             "vehicle": {"start": list(start), "yaw_deg": yaw_deg, "personality": "ardupilot"},
             "sensors": [],
             "end": {"stop": False},
@@ -116,7 +126,7 @@ class Rig:
     ) -> np.ndarray:
         """Rows (t, x, y, z, vx, vy, vz), t from now, one a physics step; ``stream`` is sent once a control period."""
         rows, began_ns = [], self.t_ns
-        for _ in range(round(seconds * 240)):
+        for _ in range(round(seconds * self.flight.world.physics_hz)):
             if self.flight.at_tick:
                 for replies in self.flight.control():
                     self.said += texts(replies)
