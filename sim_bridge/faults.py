@@ -21,7 +21,7 @@ from sim_bridge.craft import Craft
 from sim_bridge.errors import ScenarioError
 from sim_bridge.flight import Flight
 from sim_bridge.impairments import Channel, Impairment, damage_message
-from sim_bridge.messages import FORCE_DISARM, NS_PER_S, Cmd, Command, Reply, Sender
+from sim_bridge.messages import NS_PER_S, Cmd, Command, Reply, Sender
 from sim_bridge.pilot import Pilot, switch_command
 from sim_bridge.scenario_faults import LINKS, Fault
 from sim_bridge.station import Station
@@ -30,6 +30,7 @@ from sim_bridge.wires import CraftWires, Feed, damage_frame
 T = TypeVar("T")
 
 _FOREVER_S = 1e6
+_FORCE = 21196.0  # param2 of COMPONENT_ARM_DISARM: in the air too
 _FAULT_DRAWS = 2  # what these generators are for, beside the obstacles' jitter (0) and the sensors (1)
 
 
@@ -155,6 +156,8 @@ class Faults:
     def _check(self, hit: Hit) -> None:
         if hit.fault.on == "daemon" and self.companions[hit.craft].process is None:
             raise ScenarioError(f"faults[{hit.index}]: expected --check, which starts the daemon, for {hit.fault.what}")
+        if hit.fault.what == "gps":
+            raise ScenarioError(f"faults[{hit.index}]: what: expected another, no autopilot here can lose its position")
         if hit.fault.what == "rc":
             switch_command(self._flight.crafts[hit.craft], _mode_of(hit.fault))  # raises for a mode that is none
 
@@ -257,7 +260,7 @@ class Faults:
         what = hit.fault.what
         if what == "kill":
             craft = self._flight.crafts[hit.craft]
-            stop = Command(Cmd.COMPONENT_ARM_DISARM, (0.0, FORCE_DISARM, 0, 0, 0, 0, 0), Sender(craft.system_id, 1))
+            stop = Command(Cmd.COMPONENT_ARM_DISARM, (0.0, _FORCE, 0.0, 0.0, 0.0, 0.0, 0.0), Sender(craft.system_id, 1))
             replies = craft.autopilot.command(stop, craft.state, self._flight.t_ns)
             self._say(hit.craft, replies)
         elif what == "clock_jump":
