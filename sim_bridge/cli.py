@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import IO, Any
 
+from sim_bridge.check import check
 from sim_bridge.errors import ScenarioError, SimError
 from sim_bridge.flight import Flight
 from sim_bridge.lockstep_runner import Lockstep
 from sim_bridge.messages import NS_PER_S
 from sim_bridge.placement import Resolved, describe, resolve
-from sim_bridge.runner import RealTime, Trace, Wires
+from sim_bridge.runner import RealTime, Trace
 from sim_bridge.scenario import load_scenario
 from sim_bridge.scenario_schema import scenario_schema
+from sim_bridge.wires import Wires
 
 DONE, FAILED, USAGE = 0, 1, 2
 _NO_ZENOH = "none"
@@ -51,6 +55,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_scenario(run)
     run.add_argument("--lockstep", action="store_true", help="wait for the companion at each tick, not for the clock")
+    run.add_argument(
+        "--speed",
+        type=_speed,
+        default=1.0,
+        metavar="F",
+        help="vehicle time over wall time, 0.01 to 100 (default 1); what the machine cannot keep is late_s",
+    )
     run.add_argument("--stay", action="store_true", help="fly on after the end of the flight, until a signal")
     run.add_argument("--onboard-port", type=_port, default=14540, help="UDP port of the companion (default 14540)")
     run.add_argument("--gcs-port", type=_port, default=14550, help="UDP port of the ground station (default 14550)")
@@ -60,6 +71,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="ENDPOINT",
         help="where Zenoh listens (default tcp/127.0.0.1:7447), or none",
     )
+    run.add_argument(
+        "--check", action="store_true", help="fly with a daemon for each vehicle; which of the expectations failed?"
+    )
+    run.add_argument("--real-time", action="store_true", help="with --check: at the pace of the clock, not in lockstep")
+    run.add_argument("--logs", type=Path, metavar="FOLDER", help="with --check: keep what the daemons log here")
     run.add_argument("--trace", type=Path, metavar="FILE", help="write true positions as JSON lines")
     run.set_defaults(run=_run)
     show = commands.add_parser(
@@ -81,7 +97,7 @@ def _add_scenario(parser: argparse.ArgumentParser, *, positional: bool = False) 
         parser.add_argument("--scenario", default="demo", help="a shipped scenario, or a TOML file (default demo)")
     parser.add_argument("--seed", type=_seed, default=0, help="fixes every draw (default 0)")
     parser.add_argument("--no-obstacles", action="store_true", help="leave the obstacles out")
-    parser.add_argument("--name", default="uav1", help="vehicle name, the Zenoh prefix is uav/NAME (default uav1)")
+    parser.add_argument("--name", help="name of the one vehicle, Zenoh prefix uav/NAME (default: the scenario's)")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 
@@ -89,6 +105,16 @@ def _port(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 65535:
         raise argparse.ArgumentTypeError(f"expected a port, 1 to 65535, got {text}")
     return int(text)
+
+
+def _speed(text: str) -> float:
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = math.nan
+    if not 0.01 <= speed <= 100.0:
+        raise argparse.ArgumentTypeError(f"expected a factor, 0.01 to 100, got {text}")
+    return speed
 
 
 def _seed(text: str) -> int:
@@ -99,6 +125,8 @@ def _seed(text: str) -> int:
 
 def _resolved(arguments: argparse.Namespace) -> Resolved:
     name, scenario = load_scenario(arguments.scenario)
+    if arguments.name is not None and len(scenario.fleet) > 1:
+        raise ScenarioError(f"--name {arguments.name}: expected none, {name} has {len(scenario.fleet)} vehicles")
     return resolve(name, scenario, arguments.seed, obstacles=not arguments.no_obstacles)
 
 
@@ -114,10 +142,17 @@ def _schema(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    if arguments.check:
+        return _check(arguments)
+    for option in ("real_time", "logs"):
+        if getattr(arguments, option):
+            raise ScenarioError(f"--{option.replace('_', '-')}: expected --check with it")
     resolved = _resolved(arguments)
     endpoint = None if arguments.zenoh_listen == _NO_ZENOH else arguments.zenoh_listen
     if arguments.lockstep and endpoint is None:
         raise ScenarioError("--zenoh-listen none: expected an endpoint with --lockstep")
+    if arguments.lockstep and arguments.speed != 1.0:
+        raise ScenarioError("--speed: expected none with --lockstep, which runs as fast as it can")
     if arguments.onboard_port == arguments.gcs_port:
         raise ScenarioError(f"--gcs-port {arguments.gcs_port}: expected another port than --onboard-port")
     with ExitStack() as stack:
@@ -127,18 +162,58 @@ def _run(arguments: argparse.Namespace) -> int:
             onboard_port=arguments.onboard_port,
             ground_port=arguments.gcs_port,
             endpoint=endpoint,
-            prefix=f"uav/{arguments.name}",
+            prefix=None if arguments.name is None else f"uav/{arguments.name}",
             lockstep=arguments.lockstep,
         )
         stack.callback(wires.close)
         flight = Flight(resolved)
         stack.callback(flight.close)
-        kind = Lockstep if arguments.lockstep else RealTime
-        runner = kind(flight, wires, trace=trace, progress=_progress(), stay=arguments.stay)
+        runner: Lockstep | RealTime
+        if arguments.lockstep:
+            runner = Lockstep(flight, wires, trace=trace, progress=_progress(), stay=arguments.stay)
+        else:
+            runner = RealTime(
+                flight, wires, trace=trace, progress=_progress(), stay=arguments.stay, speed=arguments.speed
+            )
         with _stopped_by_signals(runner.stop):
             summary = runner.run()
     _report(summary, as_json=arguments.json)
     return FAILED if summary["collided"] or summary["ended"] == "timeout" else DONE
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    for option in ("lockstep", "stay", "name"):
+        if getattr(arguments, option):
+            raise ScenarioError(f"--{option}: expected none with --check, which flies in lockstep unless --real-time")
+    name, scenario = load_scenario(arguments.scenario)
+    with ExitStack() as stack:
+        folder: Path = arguments.logs or Path(stack.enter_context(TemporaryDirectory(prefix="sim-bridge-check-")))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ScenarioError(f"--logs {folder}: cannot be made ({error.strerror})") from None
+        result = check(
+            name,
+            scenario,
+            arguments.seed,
+            folder=folder,
+            lockstep=not arguments.real_time,
+            trace=stack.enter_context(_opened(arguments.trace)),
+            progress=_progress(),
+            log_flight=arguments.logs is not None,
+            obstacles=not arguments.no_obstacles,
+            on_stop=lambda stop: stack.enter_context(_stopped_by_signals(stop)),
+        )
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    if arguments.json:
+        print(json.dumps(result.report()))
+    else:
+        for finding in result.findings:
+            print(finding.line())
+        met = sum(finding.met for finding in result.findings)
+        print(f"{name}, seed {arguments.seed}: {met} of {len(result.findings)} expectations met")
+    return DONE if result.passed else FAILED
 
 
 @contextmanager

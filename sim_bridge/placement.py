@@ -51,14 +51,14 @@ def resolve(name: str, scenario: Scenario, seed: int, *, obstacles: bool = True)
     return Resolved(name=name, seed=seed, scenario=scenario, obstacles=placed if obstacles else ())
 
 
-def describe(resolved: Resolved, vehicle_name: str) -> dict[str, Any]:
+def describe(resolved: Resolved, vehicle_name: str | None = None) -> dict[str, Any]:
     """What `sim-bridge scenario --json` prints: all that the other side of the wires has to know."""
     scenario = resolved.scenario
     described: dict[str, Any] = msgspec.to_builtins(scenario)
     described |= {
         "name": resolved.name,
         "seed": resolved.seed,
-        "prefix": f"uav/{vehicle_name}",
+        "prefix": f"uav/{vehicle_name or scenario.vehicle.name}",
         "fleet": [_described(scenario, vehicle) for vehicle in scenario.fleet],
         "start": scenario.vehicle.start,
         "takeoff_altitude_m": scenario.vehicle.takeoff_altitude_m,
