@@ -1,6 +1,6 @@
 """A peer that acknowledges everything and does nothing: what a test of a simulator has to tell from a simulator.
 
-It says what a disarmed, healthy PX4 on the ground says, for ever: heartbeat in Hold, SYS_STATUS, HOME_POSITION, constant
+It says what a disarmed, healthy PX4 on the ground says, for ever: heartbeat in Hold, SYS_STATUS, HOME_POSITION, fixed
 position, attitude, GPS and battery, with a clock that runs. Every command is ACCEPTED, a REQUEST_MESSAGE too, though
 the message never comes; a parameter has any name, holds what was last written and acts on nothing; a mission or a
 fence is asked for item by item and ACCEPTED; TIMESYNC is answered. Nothing it is told changes what it sends.
@@ -86,9 +86,11 @@ class Dumb:
     # --- answers, by message
 
     def _on_command_long(self, m: Any, now_s: float) -> bytes:
-        return self._pack(
-            dialect.MAVLink_command_ack_message(m.command, 0, 100, 0, m.get_srcSystem(), m.get_srcComponent())
-        )
+        ack = dialect.MAVLink_command_ack_message(m.command, 0, 100, 0, m.get_srcSystem(), m.get_srcComponent())
+        self._mav.srcComponent = m.target_component or 1  # whoever was asked
+        out = self._pack(ack)
+        self._mav.srcComponent = 1
+        return out
 
     _on_command_int = _on_command_long
 

@@ -1,4 +1,4 @@
-"""MAVSDK against the simulator: discovery, the Info plugin, the link."""
+"""MAVSDK's documentation against the simulator: discovery, the Info plugin, the link."""
 
 from __future__ import annotations
 

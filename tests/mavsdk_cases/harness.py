@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import socket
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import aclosing, asynccontextmanager, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from multiprocessing import get_context
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import mavsdk
 from mavsdk import Configuration
 from mavsdk.asyncio import ComponentType, Mavsdk
 from mavsdk.asyncio.plugins.action import ActionAsync
@@ -30,12 +33,15 @@ from sim_bridge.testing import free_port
 
 LIMIT_S = 12.0  # of wall time for one wait, against every peer
 DISCOVERY_S = 20.0
+M_PER_DEG = 111_320.0  # of latitude
 SPEED = 4.0  # vehicle seconds a second
+
+_AT_ONCE = 28
 
 GROUND = ""  # a scenario's [vehicle] table: the default stands on the ground, disarmed
 AIR = "start = [0.0, 0.0, 3.0]"  # starts armed, in Hold
 
-Run = Callable[["Drone"], Awaitable[None]]
+Run = Callable[[Any], Any]
 
 
 class NotSeen(AssertionError):
@@ -44,23 +50,21 @@ class NotSeen(AssertionError):
 
 @dataclass(frozen=True)
 class Case:
-    """One promise: ``run`` against a vehicle that starts as ``vehicle`` says, at ``speed`` times real time."""
+    """One promise, against a vehicle that starts as ``vehicle`` says, at ``speed`` times real time."""
 
     name: str
-    run: Run
+    run: Run  # a coroutine function of a Drone, or where ``blocking`` a function of MAVSDK's blocking System
     vehicle: str
     speed: float
     more: str  # further tables of the scenario
+    blocking: bool
 
 
-def case(
-    vehicle: str = AIR, *, speed: float = SPEED, more: str = ""
-) -> Callable[[Run], Run]:
-    """Mark a function of one `Drone` as a case of its module."""
+def case(vehicle: str = AIR, *, speed: float = SPEED, more: str = "", blocking: bool = False) -> Callable[[Run], Run]:
+    """Mark a function as a case of its module."""
 
     def mark(run: Run) -> Run:
-        name = getattr(run, "__name__", "")
-        run.case = Case(name, run, vehicle, speed, more)  # type: ignore[attr-defined]
+        run.case = Case(run.__name__, run, vehicle, speed, more, blocking)  # type: ignore[attr-defined]
         return run
 
     return mark
@@ -80,7 +84,6 @@ class Drone:
     speed: float
     process: subprocess.Popen[bytes]
     limit_s: float = LIMIT_S
-    _kept: list[Any] = field(default_factory=list)
 
     @cached_property
     def action(self) -> Any:
@@ -139,6 +142,19 @@ class Drone:
             with suppress(asyncio.CancelledError, NotSeen):
                 await task
 
+    @asynccontextmanager
+    async def watching(self, stream: Any) -> AsyncIterator[list[Any]]:
+        """What arrives during the block."""
+        seen: list[Any] = []
+        task = asyncio.create_task(self._collect(stream, lambda update: False, seen, None))
+        await asyncio.sleep(0)  # the task subscribes
+        try:
+            yield seen
+        finally:
+            task.cancel()
+            with suppress(asyncio.CancelledError, NotSeen):
+                await task
+
     async def _collect(
         self, stream: Any, accept: Callable[[Any], bool], seen: list[Any], limit_s: float | None
     ) -> None:
@@ -177,13 +193,24 @@ class Drone:
         await self.action.takeoff()
         await self.until(self.telemetry.subscribe_landed_state(), named("IN_AIR"))
 
+    async def elapsed(self, seconds: float) -> None:
+        """Until the vehicle's clock, as the attitude is stamped, has gone on by so much."""
+        began_us = (await self.next(self.telemetry.subscribe_attitude_quaternion())).timestamp_us
+        passed = lambda q: q.timestamp_us - began_us > seconds * 1e6  # noqa: E731
+        await self.until(self.telemetry.subscribe_attitude_quaternion(), passed)
+
+    async def goto(self, north_m: float, east_m: float, up_m: float, yaw_deg: float = math.nan) -> None:
+        """Action.goto_location to a place relative to this one."""
+        here = await self.next(self.telemetry.subscribe_position())
+        latitude_deg = here.latitude_deg + north_m / M_PER_DEG
+        longitude_deg = here.longitude_deg + east_m / (M_PER_DEG * math.cos(math.radians(here.latitude_deg)))
+        await self.action.goto_location(latitude_deg, longitude_deg, here.absolute_altitude_m + up_m, yaw_deg)
+
     async def offboard_with(self, *setpoints: Awaitable[None]) -> None:
         """Offboard once the autopilot has seen a second of the stream, as PX4's guide asks for."""
         for each in setpoints:
             await each
-        stream = self.telemetry.subscribe_attitude_quaternion()
-        first = (await self.next(stream)).timestamp_us
-        await self.until(self.telemetry.subscribe_attitude_quaternion(), lambda q: q.timestamp_us - first > 1_200_000)
+        await self.elapsed(1.2)
         await self.offboard.start()
         await self.mode("OFFBOARD")
 
@@ -212,8 +239,8 @@ def refused(*results: str) -> Iterator[None]:
         yield
     except MavsdkError as error:
         result = getattr(error, "result", None)
-        assert result is not None
-        assert result.name in results, f"expected {' or '.join(results)}, got {error}"
+        if result is None or result.name not in results:
+            raise AssertionError(f"expected {' or '.join(results)}, got {error}") from error
     else:
         raise AssertionError(f"expected {' or '.join(results)}, but it was granted")
 
@@ -240,9 +267,7 @@ def dumb(ports: list[int], folder: Path) -> subprocess.Popen[bytes]:
 
 
 def _process(words: list[str], log: Any) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, *words], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log
-    )
+    return subprocess.Popen([sys.executable, *words], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
@@ -254,13 +279,25 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 async def attempt(case: Case, port: int, process: subprocess.Popen[bytes]) -> None:
     """Connect to the vehicle that sends to ``port``, and run the case."""
-    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-    async with Mavsdk(configuration) as library:
+    if case.blocking:
+        await asyncio.get_running_loop().run_in_executor(None, attempt_blocking, case, port)
+        return
+    async with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as library:
         await library.add_any_connection(f"udpin://127.0.0.1:{port}")
         system = await library.first_autopilot(timeout_s=DISCOVERY_S)
         if system is None:
             raise RuntimeError("no autopilot was discovered")
         await case.run(Drone(system, case.speed, process))
+
+
+def attempt_blocking(case: Case, port: int) -> None:
+    """The same with MAVSDK's blocking API."""
+    with mavsdk.Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as library:
+        library.add_any_connection(f"udpin://127.0.0.1:{port}")
+        system = library.first_autopilot(timeout_s=DISCOVERY_S)
+        if system is None:
+            raise RuntimeError("no autopilot was discovered")
+        case.run(system)
 
 
 def fly(case: Case, folder: Path) -> None:
@@ -274,21 +311,44 @@ def fly(case: Case, folder: Path) -> None:
         end(process)
 
 
-def fly_dumb(cases: list[Case], folder: Path) -> dict[str, BaseException | None]:
-    """Run all cases at once, each against a dumb autopilot of its own; what each of them raised."""
+@dataclass(frozen=True)
+class Outcome:
+    """How a case ended: what it raised, and whether that is a promise not kept instead of something broken."""
+
+    error: str
+    unkept: bool
+
+
+def fly_dumb(cases: list[Case], folder: Path) -> dict[str, Outcome]:
+    """Run all cases at once, each against a dumb autopilot of its own.
+
+    Spread over processes: MAVSDK has 32 MAVLink channels a process, and corrupts memory when they run out.
+    """
+    count = math.ceil(len(cases) / _AT_ONCE)
+    groups = [cases[i::count] for i in range(count)]
+    with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
+        outcomes = pool.map(_fly_dumb, groups, [folder] * count)
+        return {
+            case.name: outcome
+            for group, ended in zip(groups, outcomes, strict=True)
+            for case, outcome in zip(group, ended, strict=True)
+        }
+
+
+def _fly_dumb(cases: list[Case], folder: Path) -> list[Outcome]:
     ports = free_ports(len(cases))
     process = dumb(ports, folder)
 
     async def all_of_them() -> list[BaseException | None]:
-        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(max_workers=4 * len(cases)))
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(max_workers=5 * len(cases)))
         attempts = (attempt(case, port, process) for case, port in zip(cases, ports, strict=True))
         return await asyncio.gather(*attempts, return_exceptions=True)
 
     try:
-        outcomes = asyncio.run(all_of_them())
+        raised = asyncio.run(all_of_them())
     finally:
         end(process)
-    return {case.name: outcome for case, outcome in zip(cases, outcomes, strict=True)}
+    return [Outcome(repr(error), isinstance(error, AssertionError | MavsdkError)) for error in raised]
 
 
 def free_ports(count: int) -> list[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 
 from mavsdk.asyncio import Autopilot, Vehicle
+
 from mavsdk_cases.harness import AIR, GROUND, Drone, case
 
 

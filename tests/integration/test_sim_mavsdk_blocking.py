@@ -1,0 +1,18 @@
+"""MAVSDK's documentation against the simulator: its blocking API."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mavsdk.asyncio")
+
+from mavsdk_cases import blocking, harness
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.mark.parametrize("case", harness.cases_of(blocking), ids=lambda case: case.name)
+def test_case(case: harness.Case, tmp_path: Path) -> None:
+    harness.fly(case, tmp_path)
