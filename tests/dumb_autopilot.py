@@ -1,12 +1,13 @@
 """A peer that acknowledges everything and does nothing: what a test of a simulator has to tell from a simulator.
 
-It says what a disarmed, healthy PX4 on the ground says, for ever: heartbeat in Hold, SYS_STATUS, HOME_POSITION, fixed
-position, attitude, GPS and battery, with a clock that runs. Every command is ACCEPTED, a REQUEST_MESSAGE too, though
-the message never comes; a parameter has any name, holds what was last written and acts on nothing; a mission or a
-fence is asked for item by item and ACCEPTED; TIMESYNC is answered. Nothing it is told changes what it sends.
+It says what a healthy PX4 in Hold says, for ever, disarmed on the ground or armed at a height: heartbeat, SYS_STATUS,
+HOME_POSITION, a fixed position, attitude, GPS and battery, with a clock that runs. Every command is ACCEPTED, a
+REQUEST_MESSAGE too, though the message never comes; a parameter has any name, holds what was last written and acts on
+nothing; a mission or a fence is asked for item by item and ACCEPTED; TIMESYNC is answered. Nothing it is told changes
+what it sends.
 
-Plain pymavlink. Run as a process: ``python dumb_autopilot.py PORT...``, one such vehicle a port, each sending to
-127.0.0.1:PORT, where a ground station listens.
+Plain pymavlink. Run as a process: ``python dumb_autopilot.py PORT@HEIGHT...``, one such vehicle a port, each sending to
+127.0.0.1:PORT, where a ground station listens; HEIGHT in metres above home, 0 on the ground.
 """
 
 from __future__ import annotations
@@ -34,10 +35,12 @@ NAN = float("nan")
 class Dumb:
     """One vehicle: ``answer`` bytes in, bytes out; ``slow`` and ``fast`` are what it says unasked."""
 
-    def __init__(self, boot_s: float) -> None:
+    def __init__(self, boot_s: float, height_m: float) -> None:
         self._mav = dialect.MAVLink(None, 1, 1)
         self._mav.robust_parsing = True
         self._boot_s = boot_s
+        self._height_m = height_m
+        self._flies = height_m > 0.0
         self._parameters: dict[str, tuple[float, int]] = {}  # value as it is on the wire, MAV_PARAM_TYPE
         self._items = 0
 
@@ -45,13 +48,14 @@ class Dumb:
         """The messages of 1 Hz."""
         cells = [4100] + [UNKNOWN] * 9
         level = [1.0, 0.0, 0.0, 0.0]
+        altitude_mm = ALT_MM + round(1e3 * self._height_m)
         return self._pack(
-            dialect.MAVLink_heartbeat_message(2, 12, 1 | 4 | 16, HOLD, 3, 3),
+            dialect.MAVLink_heartbeat_message(2, 12, 1 | 4 | 16 | 128 * self._flies, HOLD, 3 + self._flies, 3),
             dialect.MAVLink_sys_status_message(HEALTHY, HEALTHY, HEALTHY, 100, 4100, -1, 100, 0, 0, 0, 0, 0, 0),
             dialect.MAVLink_battery_status_message(0, 0, 1, 32767, cells, -1, -1, -1, 100),
             dialect.MAVLink_home_position_message(LAT, LON, ALT_MM, 0.0, 0.0, 0.0, level, 0.0, 0.0, 0.0),
             dialect.MAVLink_gps_raw_int_message(
-                self._us(now_s), 3, LAT, LON, ALT_MM, 80, 80, 0, UNKNOWN, 12, ALT_MM, 800, 800, 100
+                self._us(now_s), 3, LAT, LON, altitude_mm, 80, 80, 0, UNKNOWN, 12, altitude_mm, 800, 800, 100
             ),
             dialect.MAVLink_system_time_message(time.time_ns() // 1000, self._ms(now_s)),
         )
@@ -59,19 +63,21 @@ class Dumb:
     def fast(self, now_s: float) -> bytes:
         """The messages of 5 Hz."""
         ms, us = self._ms(now_s), self._us(now_s)
+        imu = (0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0.2, 0.0, 0.4)  # accelerometer, gyro, magnetometer
         unknown = [NAN] + [0.0] * 20
+        above_mm, h = round(1e3 * self._height_m), self._height_m
         return self._pack(
-            dialect.MAVLink_extended_sys_state_message(0, 1),
-            dialect.MAVLink_global_position_int_message(ms, LAT, LON, ALT_MM, 0, 0, 0, 0, 0),
-            dialect.MAVLink_local_position_ned_message(ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+            dialect.MAVLink_extended_sys_state_message(0, 1 + self._flies),
+            dialect.MAVLink_global_position_int_message(ms, LAT, LON, ALT_MM + above_mm, above_mm, 0, 0, 0, 0),
+            dialect.MAVLink_local_position_ned_message(ms, 0.0, 0.0, -h, 0.0, 0.0, 0.0),
             dialect.MAVLink_attitude_message(ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
             dialect.MAVLink_attitude_quaternion_message(ms, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
             dialect.MAVLink_odometry_message(
-                us, 1, 12, 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], *[0.0] * 6, unknown, unknown, 0, 1, 100
+                us, 1, 12, 0.0, 0.0, -h, [1.0, 0.0, 0.0, 0.0], *[0.0] * 6, unknown, unknown, 0, 1, 100
             ),
-            dialect.MAVLink_altitude_message(us, 488.0, 488.0, 0.0, 0.0, NAN, NAN),
-            dialect.MAVLink_vfr_hud_message(0.0, 0.0, 0, 0, 488.0, 0.0),
-            dialect.MAVLink_highres_imu_message(us, 0, 0, -9.81, 0, 0, 0, 0.2, 0, 0.4, 955.0, 0, 488.0, 20.0, 0x1FFF),
+            dialect.MAVLink_altitude_message(us, 488.0 + h, 488.0 + h, h, h, NAN, NAN),
+            dialect.MAVLink_vfr_hud_message(0.0, 0.0, 0, 50 * self._flies, 488.0 + h, 0.0),
+            dialect.MAVLink_highres_imu_message(us, *imu, 955.0, 0, 488.0 + h, 20.0, 0x1FFF),
         )
 
     def answer(self, data: bytes, now_s: float) -> bytes:
@@ -157,15 +163,15 @@ class Dumb:
         return int((now_s - self._boot_s) * 1e6)
 
 
-def serve(ports: Sequence[int]) -> None:
-    """One vehicle a port, until the process is ended."""
+def serve(places: Sequence[tuple[int, float]]) -> None:
+    """One vehicle a port and height, until the process is ended."""
     selector = selectors.DefaultSelector()
     vehicles = []
-    for port in ports:
+    for port, height_m in places:
         link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         link.bind(("127.0.0.1", 0))
         link.connect(("127.0.0.1", port))
-        vehicle = Dumb(time.monotonic())
+        vehicle = Dumb(time.monotonic(), height_m)
         selector.register(link, selectors.EVENT_READ, vehicle)
         vehicles.append((link, vehicle))
     slow_s = fast_s = time.monotonic()
@@ -193,4 +199,4 @@ def send(link: socket.socket, data: bytes) -> None:
 
 
 if __name__ == "__main__":
-    serve([int(word) for word in sys.argv[1:]])
+    serve([(int(port), float(height)) for port, height in (word.split("@") for word in sys.argv[1:])])

@@ -8,11 +8,11 @@ import pytest
 
 pytest.importorskip("mavsdk.asyncio")
 
-from mavsdk_cases import actions, harness
+from mavsdk_cases import actions, harness, peers
 
 pytestmark = pytest.mark.integration
 
 
 @pytest.mark.parametrize("case", harness.cases_of(actions), ids=lambda case: case.name)
 def test_case(case: harness.Case, tmp_path: Path) -> None:
-    harness.fly(case, tmp_path)
+    peers.fly(case, tmp_path)

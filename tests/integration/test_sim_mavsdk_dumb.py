@@ -14,6 +14,7 @@ from mavsdk_cases import (
     information,
     offboarding,
     parameters,
+    peers,
     pilot,
     plans,
     rates,
@@ -28,13 +29,13 @@ CASES = harness.cases_of(
 
 
 @pytest.fixture(scope="module")
-def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, harness.Outcome]:
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, peers.Outcome]:
     """All at once, with the time limits of the simulator's runs."""
-    return harness.fly_dumb(CASES, tmp_path_factory.mktemp("dumb"))
+    return peers.fly_dumb(CASES, tmp_path_factory.mktemp("dumb"))
 
 
 @pytest.mark.parametrize("name", [case.name for case in CASES])
-def test_case_fails(name: str, outcomes: dict[str, harness.Outcome]) -> None:
+def test_case_fails(name: str, outcomes: dict[str, peers.Outcome]) -> None:
     """By a promise that is not kept, not because the peer could not be reached or the case is broken."""
     outcome = outcomes[name]
     assert outcome.unkept, outcome.error

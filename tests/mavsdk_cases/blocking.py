@@ -106,6 +106,7 @@ def blocking_return_to_launch(system: Any) -> None:
     """Action.return_to_launch: mode and climb to the altitude that was set."""
     action, telemetry = Action(system), Telemetry(system)
     action.set_return_to_launch_altitude(4.5)
+    Param(system).set_param_int("RTL_CONE_ANG", 0)
     with updates(telemetry, "flight_mode") as mode, updates(telemetry, "position") as position:
         here = position(lambda p: True)
         action.goto_location(here.latitude_deg + 5e-5, here.longitude_deg, here.absolute_altitude_m, 0.0)

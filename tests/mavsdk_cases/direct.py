@@ -7,7 +7,7 @@ from typing import Any
 
 from mavsdk.plugins.mavlink_direct import MavlinkMessage
 
-from mavsdk_cases.harness import AIR, GROUND, Drone, case
+from mavsdk_cases.harness import AIR, GROUND, Drone, case, refused
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
 HOLD, LAND, OFFBOARD = 4 << 16 | 3 << 24, 4 << 16 | 6 << 24, 6 << 16
@@ -56,8 +56,6 @@ async def a_command_that_nobody_knows_is_unsupported(drone: Drone) -> None:
 @case(GROUND)
 async def a_command_to_another_component_is_not_answered(drone: Drone) -> None:
     """Component 42 is not there, so that no final ack comes and the result is TIMEOUT."""
-    from mavsdk_cases.harness import refused
-
     with refused("TIMEOUT"):
         await command(drone, 176, 1.0, 4.0, 6.0, component=42)
 

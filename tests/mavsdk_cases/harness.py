@@ -1,25 +1,17 @@
-"""Cases, the peers they run against, and how a case waits: by subscription with a time limit, never by sleep."""
+"""What a case is, and how it waits: by subscription with a time limit, never by sleep."""
 
 from __future__ import annotations
 
 import asyncio
 import math
-import socket
 import subprocess
-import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import aclosing, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
-from multiprocessing import get_context
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import mavsdk
-from mavsdk import Configuration
-from mavsdk.asyncio import ComponentType, Mavsdk
 from mavsdk.asyncio.plugins.action import ActionAsync
 from mavsdk.asyncio.plugins.info import InfoAsync
 from mavsdk.asyncio.plugins.manual_control import ManualControlAsync
@@ -29,14 +21,9 @@ from mavsdk.asyncio.plugins.param import ParamAsync
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavsdk.exceptions import MavsdkError
 
-from sim_bridge.testing import free_port
-
 LIMIT_S = 12.0  # of wall time for one wait, against every peer
-DISCOVERY_S = 20.0
 M_PER_DEG = 111_320.0  # of latitude
 SPEED = 4.0  # vehicle seconds a second
-
-_AT_ONCE = 28
 
 GROUND = ""  # a scenario's [vehicle] table: the default stands on the ground, disarmed
 AIR = "start = [0.0, 0.0, 3.0]"  # starts armed, in Hold
@@ -186,6 +173,14 @@ class Drone:
         """In the air, as the scenario put it there."""
         await self.until(self.telemetry.subscribe_in_air(), bool)
 
+    async def fenced_out(self) -> None:
+        """Home is moved 60 m away and the fence drawn 20 m around it."""
+        home = await self.next(self.telemetry.subscribe_home())
+        latitude_deg = home.latitude_deg + 60.0 / M_PER_DEG
+        await self.param.set_param_int("GF_ACTION", 2)
+        await self.param.set_param_float("GF_MAX_HOR_DIST", 20.0)
+        await self.action.set_home(False, latitude_deg, home.longitude_deg, home.absolute_altitude_m)
+
     async def took_off(self) -> None:
         """Arm on the ground and take off."""
         await self.healthy()
@@ -243,121 +238,3 @@ def refused(*results: str) -> Iterator[None]:
             raise AssertionError(f"expected {' or '.join(results)}, got {error}") from error
     else:
         raise AssertionError(f"expected {' or '.join(results)}, but it was granted")
-
-
-# --- peers
-
-
-def simulator(case: Case, folder: Path) -> tuple[subprocess.Popen[bytes], int]:
-    """The simulator that a case wants, and the port to listen on."""
-    scenario = folder / f"{case.name}.toml"
-    scenario.write_text(f"[vehicle]\n{case.vehicle}\n[end]\nstop = false\n{case.more}\n", encoding="utf-8")
-    port = free_port()
-    words = ["run", "--scenario", str(scenario), "--stay", "--speed", str(case.speed), "--zenoh-listen", "none"]
-    words += ["--onboard-port", str(free_port()), "--gcs-port", str(port)]
-    with (folder / "simulator.log").open("ab") as log:
-        return _process(["-m", "sim_bridge.cli", *words], log), port
-
-
-def dumb(ports: list[int], folder: Path) -> subprocess.Popen[bytes]:
-    """As many dumb autopilots as ``ports``, in one process."""
-    script = Path(__file__).parent.parent / "dumb_autopilot.py"
-    with (folder / "dumb.log").open("ab") as log:
-        return _process([str(script), *map(str, ports)], log)
-
-
-def _process(words: list[str], log: Any) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, *words], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log)
-
-
-def end(process: subprocess.Popen[bytes]) -> None:
-    """The process is gone afterwards."""
-    if process.poll() is None:
-        process.kill()
-    process.wait()
-
-
-async def attempt(case: Case, port: int, process: subprocess.Popen[bytes]) -> None:
-    """Connect to the vehicle that sends to ``port``, and run the case."""
-    if case.blocking:
-        await asyncio.get_running_loop().run_in_executor(None, attempt_blocking, case, port)
-        return
-    async with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as library:
-        await library.add_any_connection(f"udpin://127.0.0.1:{port}")
-        system = await library.first_autopilot(timeout_s=DISCOVERY_S)
-        if system is None:
-            raise RuntimeError("no autopilot was discovered")
-        await case.run(Drone(system, case.speed, process))
-
-
-def attempt_blocking(case: Case, port: int) -> None:
-    """The same with MAVSDK's blocking API."""
-    with mavsdk.Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as library:
-        library.add_any_connection(f"udpin://127.0.0.1:{port}")
-        system = library.first_autopilot(timeout_s=DISCOVERY_S)
-        if system is None:
-            raise RuntimeError("no autopilot was discovered")
-        case.run(system)
-
-
-def fly(case: Case, folder: Path) -> None:
-    """Run a case against the simulator."""
-    process, port = simulator(case, folder)
-    try:
-        with asyncio.Runner() as runner:
-            runner.get_loop().set_default_executor(ThreadPoolExecutor(max_workers=12))
-            runner.run(attempt(case, port, process))
-    finally:
-        end(process)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a case ended: what it raised, and whether that is a promise not kept instead of something broken."""
-
-    error: str
-    unkept: bool
-
-
-def fly_dumb(cases: list[Case], folder: Path) -> dict[str, Outcome]:
-    """Run all cases at once, each against a dumb autopilot of its own.
-
-    Spread over processes: MAVSDK has 32 MAVLink channels a process, and corrupts memory when they run out.
-    """
-    count = math.ceil(len(cases) / _AT_ONCE)
-    groups = [cases[i::count] for i in range(count)]
-    with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
-        outcomes = pool.map(_fly_dumb, groups, [folder] * count)
-        return {
-            case.name: outcome
-            for group, ended in zip(groups, outcomes, strict=True)
-            for case, outcome in zip(group, ended, strict=True)
-        }
-
-
-def _fly_dumb(cases: list[Case], folder: Path) -> list[Outcome]:
-    ports = free_ports(len(cases))
-    process = dumb(ports, folder)
-
-    async def all_of_them() -> list[BaseException | None]:
-        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(max_workers=5 * len(cases)))
-        attempts = (attempt(case, port, process) for case, port in zip(cases, ports, strict=True))
-        return await asyncio.gather(*attempts, return_exceptions=True)
-
-    try:
-        raised = asyncio.run(all_of_them())
-    finally:
-        end(process)
-    return [Outcome(repr(error), isinstance(error, AssertionError | MavsdkError)) for error in raised]
-
-
-def free_ports(count: int) -> list[int]:
-    """Different ports, all of them held until the last is known."""
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    try:
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in sockets]
-    finally:
-        for each in sockets:
-            each.close()

@@ -6,7 +6,7 @@ import signal
 
 from mavsdk.asyncio import Autopilot, Vehicle
 
-from mavsdk_cases.harness import AIR, GROUND, Drone, case
+from mavsdk_cases.harness import AIR, GROUND, Drone, case, named
 
 
 @case(GROUND)
@@ -42,15 +42,17 @@ async def speed_factor_is_that_of_the_simulation(drone: Drone) -> None:
 
 @case(AIR)
 async def a_vehicle_in_flight_is_found_and_described(drone: Drone) -> None:
-    """System: is connected, a PX4, a multicopter, system 1 component 1; and it flies, as its landed state says."""
+    """System: is connected, a PX4, a multicopter, system 1 component 1; it flies, and then lands."""
     assert await drone.system.is_connected()
     assert await drone.system.has_autopilot()
     assert await drone.system.autopilot_type() == Autopilot.PX4
     assert await drone.system.vehicle_type() == Vehicle.MULTICOPTER
     assert await drone.system.get_system_id() == 1
     assert 1 in await drone.system.component_ids()
-    await drone.until(drone.telemetry.subscribe_landed_state(), lambda state: state.name == "IN_AIR")
-    assert await drone.telemetry.armed()
+    await drone.until(drone.telemetry.subscribe_landed_state(), named("IN_AIR"))
+    await drone.until(drone.telemetry.subscribe_armed(), bool)
+    async with drone.expecting(drone.telemetry.subscribe_landed_state(), named("LANDING")):
+        await drone.action.land()
 
 
 @case(AIR)
@@ -64,4 +66,5 @@ async def a_lost_link_is_told_and_the_flight_is_found_again(drone: Drone) -> Non
     async with drone.expecting(drone.system.is_connected_state(), bool):
         drone.process.send_signal(signal.SIGCONT)
     await drone.flying()
-    assert (await drone.ned()).position.down_m < -2.5
+    await drone.action.land()
+    await drone.mode("LAND")

@@ -8,7 +8,8 @@ from contextlib import asynccontextmanager, suppress
 
 from mavsdk.plugins.offboard import VelocityNedYaw
 
-from mavsdk_cases.harness import AIR, Drone, case, refused
+from mavsdk_cases.direct import DENIED, TEMPORARILY_REJECTED, command
+from mavsdk_cases.harness import AIR, GROUND, Drone, case, named, refused
 
 SPEED = 2.0
 
@@ -84,9 +85,40 @@ async def the_pilot_takes_over_from_offboard(drone: Drone) -> None:
 
 
 @case(AIR, speed=SPEED)
-async def manual_modes_need_input(drone: Drone) -> None:
-    """start_position_control: "Requires manual control input to be sent regularly already"."""
+async def moved_sticks_take_over(drone: Drone) -> None:
+    """PX4's COM_RC_OVERRIDE bit 0: moved by more than COM_RC_STICK_OV in an automatic mode, they have Position mode."""
     await drone.flying()
-    with refused("INPUT_NOT_SET", "COMMAND_DENIED"):
+    async with hands_on(drone) as sticks:
+        assert (await drone.next(drone.telemetry.subscribe_flight_mode())).name == "HOLD"
+        async with drone.expecting(drone.telemetry.subscribe_flight_mode(), named("POSCTL")):
+            sticks.now = (0.7, 0.0, 0.5, 0.0)
+        await drone.ned(lambda ned: ned.velocity.east_m_s > 0.3)
+
+
+@case(GROUND, speed=SPEED)
+async def a_pilot_who_goes_silent_is_a_failsafe(drone: Drone) -> None:
+    """PX4's NAV_RCL_ACT = 3: in Position mode without sticks for COM_RC_LOSS_T, it lands by itself and says why."""
+    await drone.param.set_param_int("NAV_RCL_ACT", 3)
+    await drone.param.set_param_float("COM_FAIL_ACT_T", 0.0)
+    async with hands_on(drone):
+        await drone.took_off()
+        await drone.mode("HOLD")
         await drone.manual.start_position_control()
+        await drone.mode("POSCTL")
+    texts = drone.telemetry.subscribe_status_text()
+    async with (
+        drone.expecting(texts, lambda text: "manual control" in text.text.lower()),
+        drone.expecting(drone.telemetry.subscribe_flight_mode(), named("LAND")),
+    ):
+        pass
+
+
+@case(AIR, speed=SPEED)
+async def manual_modes_need_input(drone: Drone) -> None:
+    """start_altitude_control: "Requires manual control input to be sent regularly already"; MAVSDK says so itself,
+    and the vehicle refuses the mode to whoever asks past MAVSDK."""
+    await drone.flying()
+    with refused("INPUT_NOT_SET"):
+        await drone.manual.start_altitude_control()
+    assert await command(drone, 176, 1.0, 2.0, 0.0) in (TEMPORARILY_REJECTED, DENIED)
     assert (await drone.next(drone.telemetry.subscribe_flight_mode())).name == "HOLD"

@@ -9,7 +9,7 @@ from mavsdk.plugins.mission import MissionItem, MissionPlan
 
 from mavsdk_cases.harness import AIR, GROUND, Drone, case, refused
 
-REFUSED = ("UNSUPPORTED", "DENIED", "ERROR", "UNSUPPORTED_MISSION_CMD")
+REFUSED = ("UNSUPPORTED", "DENIED", "ERROR", "UNSUPPORTED_MISSION_CMD", "INT_MESSAGES_NOT_SUPPORTED")
 
 
 @case(GROUND)
@@ -34,7 +34,7 @@ async def a_fence_is_refused(drone: Drone) -> None:
 
 @case(AIR)
 async def a_fence_by_parameter_stops_the_flight(drone: Drone) -> None:
-    """PX4's GF_MAX_HOR_DIST and GF_ACTION = 2 (Hold): beyond the fence the mode changes and a STATUSTEXT says why."""
+    """PX4's GF_MAX_HOR_DIST and GF_ACTION = 3 (Return): beyond the fence the mode changes and a STATUSTEXT says why."""
     await drone.param.set_param_float("GF_MAX_HOR_DIST", 4.0)
     await drone.param.set_param_int("GF_ACTION", 3)
     texts = drone.telemetry.subscribe_status_text()
