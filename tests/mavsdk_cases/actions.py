@@ -71,11 +71,16 @@ async def an_empty_battery_lands_the_vehicle(drone: Drone) -> None:
 
 
 @case(GROUND)
-async def takeoff_without_arming_is_refused(drone: Drone) -> None:
-    """takeoff: "Note that the vehicle must be armed before it can take off"."""
+async def takeoff_waits_for_arming(drone: Drone) -> None:
+    """takeoff: "the vehicle must be armed before it can take off"; PX4 grants the mode, and goes when it is armed."""
     await drone.healthy()
-    with refused("COMMAND_DENIED"):
-        await drone.action.takeoff()
+    await drone.action.takeoff()
+    await drone.mode("TAKEOFF")
+    await drone.elapsed(1.5)
+    assert not await drone.next(drone.telemetry.subscribe_in_air())
+    assert (await drone.ned()).position.down_m > -0.5
+    async with drone.expecting(drone.telemetry.subscribe_in_air(), bool):
+        await drone.action.arm()
 
 
 @case(GROUND)

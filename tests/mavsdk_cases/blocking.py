@@ -55,14 +55,13 @@ def blocking_takeoff_and_landing(system: Any) -> None:
         armed(lambda value: not value)
 
 
-@case(GROUND, blocking=True)
-def blocking_takeoff_unarmed_is_refused(system: Any) -> None:
-    """Action.takeoff raises ActionError with its result."""
-    telemetry = Telemetry(system)
-    with updates(telemetry, "health_all_ok") as health:
-        health(bool)
-    with refused("COMMAND_DENIED"):
-        Action(system).takeoff()
+@case(AIR, blocking=True)
+def blocking_disarm_in_the_air_is_refused(system: Any) -> None:
+    """Action.disarm raises ActionError with its result."""
+    with updates(Telemetry(system), "in_air") as in_air:
+        in_air(bool)
+    with refused("COMMAND_DENIED", "COMMAND_DENIED_NOT_LANDED"):
+        Action(system).disarm()
 
 
 @case(AIR, blocking=True)

@@ -97,6 +97,6 @@ async def a_setpoint_is_echoed(drone: Drone) -> None:
     message = MavlinkMessage("SET_POSITION_TARGET_LOCAL_NED", 245, 190, 1, 1, json.dumps(fields))
     assert await command(drone, 511, 85.0, 100_000.0) == ACCEPTED
     echoes = drone.direct.subscribe_message("POSITION_TARGET_LOCAL_NED")
-    ours = lambda echo: abs(json.loads(echo.fields_json)["afx"] - 0.75) < 1e-6  # noqa: E731
+    ours = lambda echo: json.loads(echo.fields_json)["afx"] == 0.75  # noqa: E731
     async with drone.expecting(echoes, ours):
         await drone.direct.send_message(message)

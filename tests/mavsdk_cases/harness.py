@@ -201,6 +201,13 @@ class Drone:
         longitude_deg = here.longitude_deg + east_m / (M_PER_DEG * math.cos(math.radians(here.latitude_deg)))
         await self.action.goto_location(latitude_deg, longitude_deg, here.absolute_altitude_m + up_m, yaw_deg)
 
+    async def offboard_ends(self) -> None:
+        """Until MAVSDK's is_active is False: it gives up seconds after it has heard of another mode."""
+        async with asyncio.timeout(self.limit_s), aclosing(self.telemetry.subscribe_attitude_quaternion()) as moments:
+            async for _ in moments:
+                if not await self.offboard.is_active():
+                    return
+
     async def offboard_with(self, *setpoints: Awaitable[None]) -> None:
         """Offboard once the autopilot has seen a second of the stream, as PX4's guide asks for."""
         for each in setpoints:

@@ -81,7 +81,7 @@ async def the_pilot_takes_over_from_offboard(drone: Drone) -> None:
         await drone.manual.start_position_control()
         await drone.mode("POSCTL")
         await drone.ned(lambda ned: abs(ned.velocity.north_m_s) < 0.1)
-        assert not await drone.offboard.is_active()
+        await drone.offboard_ends()
 
 
 @case(AIR, speed=SPEED)

@@ -6,6 +6,7 @@ from mavsdk.asyncio.plugins.geofence import GeofenceAsync
 from mavsdk.asyncio.plugins.mission import MissionAsync
 from mavsdk.plugins.geofence import FenceType, GeofenceData, Point, Polygon
 from mavsdk.plugins.mission import MissionItem, MissionPlan
+from mavsdk.plugins.offboard import VelocityNedYaw
 
 from mavsdk_cases.harness import AIR, GROUND, Drone, case, refused
 
@@ -32,7 +33,7 @@ async def a_fence_is_refused(drone: Drone) -> None:
         await geofence.upload_geofence(GeofenceData([Polygon(corners, FenceType.INCLUSION)], []))
 
 
-@case(AIR)
+@case(AIR, speed=3.0)
 async def a_fence_by_parameter_stops_the_flight(drone: Drone) -> None:
     """PX4's GF_MAX_HOR_DIST and GF_ACTION = 3 (Return): beyond the fence the mode changes and a STATUSTEXT says why."""
     await drone.param.set_param_float("GF_MAX_HOR_DIST", 4.0)
@@ -42,4 +43,4 @@ async def a_fence_by_parameter_stops_the_flight(drone: Drone) -> None:
         drone.expecting(texts, lambda text: "fence" in text.text.lower()),
         drone.expecting(drone.telemetry.subscribe_flight_mode(), lambda mode: mode.name == "RETURN_TO_LAUNCH"),
     ):
-        await drone.goto(30.0, 0.0, 0.0)
+        await drone.offboard_with(drone.offboard.set_velocity_ned(VelocityNedYaw(3.0, 0.0, 0.0, 0.0)))
