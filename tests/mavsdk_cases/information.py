@@ -35,6 +35,7 @@ async def product_is_told(drone: Drone) -> None:
 @case(GROUND, speed=3.0)
 async def speed_factor_is_that_of_the_simulation(drone: Drone) -> None:
     """Info.get_speed_factor: "a simulation can run faster or slower than realtime"."""
+    _ = drone.info  # hears the clock from here on
     clocks = await drone.take(drone.telemetry.subscribe_attitude_euler(), 60)
     factor = await drone.info.get_speed_factor()
     assert 0.75 * drone.speed < factor < 1.25 * drone.speed, (factor, len(clocks))

@@ -84,16 +84,14 @@ async def position_is_flown_with_velocity_fed_forward(drone: Drone) -> None:
 @case(AIR, speed=SPEED)
 async def acceleration_ned_changes_the_velocity(drone: Drone) -> None:
     """set_acceleration_ned: 1 m/s^2 to the north for two seconds gives about 2 m/s."""
+    await drone.telemetry.set_rate_odometry(20.0)
     await drone.offboard_with(drone.offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 90.0)))
     await drone.offboard.set_acceleration_ned(AccelerationNed(1.0, 0.0, 0.0))
     await drone.ned(lambda ned: ned.velocity.north_m_s > 0.3)
-    before = await drone.next(drone.telemetry.subscribe_odometry())
-    v0 = (await drone.ned()).velocity.north_m_s
-    await drone.elapsed(1.0)
-    v1 = (await drone.ned()).velocity.north_m_s
-    after = await drone.next(drone.telemetry.subscribe_odometry())
+    before, *_, after = await drone.take(drone.telemetry.subscribe_odometry(), 21)
+    speeds_m_s = [math.hypot(o.velocity_body.x_m_s, o.velocity_body.y_m_s) for o in (before, after)]
     seconds = (after.time_usec - before.time_usec) / 1e6
-    assert 0.6 < (v1 - v0) / seconds < 1.4
+    assert 0.7 < (speeds_m_s[1] - speeds_m_s[0]) / seconds < 1.3
     assert abs((await drone.ned()).velocity.east_m_s) < 0.2
 
 

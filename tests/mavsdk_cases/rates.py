@@ -57,10 +57,10 @@ async def rate_of_the_position(drone: Drone) -> None:
 
 
 @case(GROUND)
-async def a_rate_beyond_the_vehicle_is_denied(drone: Drone) -> None:
-    """set_rate_*: a TelemetryError "contains the reason for the failure" where a rate cannot be had."""
-    with refused("COMMAND_DENIED", "UNSUPPORTED"):
-        await drone.telemetry.set_rate_attitude_quaternion(50_000.0)
+async def the_rate_of_what_is_not_there_is_refused(drone: Drone) -> None:
+    """set_rate_distance_sensor: a TelemetryError "contains the reason for the failure"; there is no such sensor."""
+    with refused("COMMAND_DENIED", "UNSUPPORTED", "UNKNOWN"):
+        await drone.telemetry.set_rate_distance_sensor(10.0)
 
 
 @case(GROUND, speed=1.0)
