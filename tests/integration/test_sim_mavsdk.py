@@ -48,7 +48,7 @@ def simulator(tmp_path: Path) -> Iterator[Callable[..., tuple[subprocess.Popen[b
 
     def run(scenario: str = "empty") -> tuple[subprocess.Popen[bytes], int]:
         onboard, ground = free_ports(2)
-        ports = ["--onboard-port", str(onboard), "--gcs-port", str(ground), "--zenoh-listen", "none"]
+        ports = ["--onboard-port", str(onboard), "--gcs-port", str(ground), "--zenoh-listen", "none", "--speed", "3"]
         process = start(["run", "--scenario", scenario, *ports, "--json"], tmp_path / "simulator.log")
         started.append(process)
         return process, ground

@@ -10,7 +10,7 @@ from mavsdk_cases.direct import ACCEPTED, command
 from mavsdk_cases.harness import AIR, GROUND, M_PER_DEG, Drone, case, in_order, named, refused
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def arms_and_disarms(drone: Drone) -> None:
     """arm and disarm "a drone that considers itself landed"."""
     await drone.healthy()
@@ -218,7 +218,7 @@ async def home_moves_when_it_is_set(drone: Drone) -> None:
         await drone.action.set_home(False, latitude_deg, old.longitude_deg, old.absolute_altitude_m)
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def what_the_vehicle_has_not_is_refused(drone: Drone) -> None:
     """A relay or an actuator that does not exist: the action "contains the reason for the failure"."""
     from mavsdk.plugins.action import RelayCommand

@@ -48,20 +48,20 @@ async def offboard_by_command_needs_a_stream(drone: Drone) -> None:
     assert await command(drone, 176, 1.0, 6.0, 0.0) in (TEMPORARILY_REJECTED, DENIED)
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def a_command_that_nobody_knows_is_unsupported(drone: Drone) -> None:
     """The command protocol: MAV_RESULT_UNSUPPORTED for MAV_CMD_USER_5 (31014)."""
     assert await command(drone, 31014) == UNSUPPORTED
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def a_command_to_another_component_is_not_answered(drone: Drone) -> None:
     """Component 42 is not there, so that no final ack comes and the result is TIMEOUT."""
     with refused("TIMEOUT"):
         await command(drone, 176, 1.0, 4.0, 6.0, component=42)
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def a_requested_message_comes(drone: Drone) -> None:
     """MAV_CMD_REQUEST_MESSAGE (512) for AUTOPILOT_VERSION (148), with its capabilities."""
     versions = drone.direct.subscribe_message("AUTOPILOT_VERSION")
@@ -72,7 +72,7 @@ async def a_requested_message_comes(drone: Drone) -> None:
         assert capabilities & bit
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def message_intervals_are_granted_told_and_limited(drone: Drone) -> None:
     """SET_MESSAGE_INTERVAL (511) and GET_MESSAGE_INTERVAL (510) of ATTITUDE_QUATERNION; 1 MHz cannot be had, and where
     it is not denied the interval that is told is the one that can be had."""

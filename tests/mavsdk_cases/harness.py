@@ -45,13 +45,16 @@ class Case:
     speed: float
     more: str  # further tables of the scenario
     blocking: bool
+    alters: bool  # False: the next case finds the vehicle as this one did
 
 
-def case(vehicle: str = AIR, *, speed: float = SPEED, more: str = "", blocking: bool = False) -> Callable[[Run], Run]:
+def case(
+    vehicle: str = AIR, *, speed: float = SPEED, more: str = "", blocking: bool = False, alters: bool = True
+) -> Callable[[Run], Run]:
     """Mark a function as a case of its module."""
 
     def mark(run: Run) -> Run:
-        run.case = Case(run.__name__, run, vehicle, speed, more, blocking)  # type: ignore[attr-defined]
+        run.case = Case(run.__name__, run, vehicle, speed, more, blocking, alters)  # type: ignore[attr-defined]
         return run
 
     return mark
@@ -201,12 +204,26 @@ class Drone:
         longitude_deg = here.longitude_deg + east_m / (M_PER_DEG * math.cos(math.radians(here.latitude_deg)))
         await self.action.goto_location(latitude_deg, longitude_deg, here.absolute_altitude_m + up_m, yaw_deg)
 
+    async def poll(self, ask: Callable[[], Awaitable[bool]]) -> None:
+        """Ask with each update of the attitude until the answer is yes: for what cannot be subscribed to."""
+        try:
+            async with (
+                asyncio.timeout(self.limit_s),
+                aclosing(self.telemetry.subscribe_attitude_quaternion()) as moments,
+            ):
+                async for _ in moments:
+                    if await ask():
+                        return
+        except TimeoutError:
+            raise NotSeen(f"not so within {self.limit_s} s") from None
+
     async def offboard_ends(self) -> None:
         """Until MAVSDK's is_active is False: it gives up seconds after it has heard of another mode."""
-        async with asyncio.timeout(self.limit_s), aclosing(self.telemetry.subscribe_attitude_quaternion()) as moments:
-            async for _ in moments:
-                if not await self.offboard.is_active():
-                    return
+
+        async def over() -> bool:
+            return not await self.offboard.is_active()
+
+        await self.poll(over)
 
     async def offboard_with(self, *setpoints: Awaitable[None]) -> None:
         """Offboard once the autopilot has seen a second of the stream, as PX4's guide asks for."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
 
 from mavsdk.asyncio import Autopilot, Vehicle
@@ -10,7 +9,7 @@ from mavsdk.asyncio import Autopilot, Vehicle
 from mavsdk_cases.harness import AIR, GROUND, Drone, case, named
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def version_is_told(drone: Drone) -> None:
     """Info.get_version: "Get the version information of the system"."""
     version = await drone.info.get_version()
@@ -18,14 +17,14 @@ async def version_is_told(drone: Drone) -> None:
     assert version.flight_sw_version_type.name == "RELEASE"
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def identification_is_told(drone: Drone) -> None:
     """Info.get_identification: a UID that is one."""
     identification = await drone.info.get_identification()
     assert identification.legacy_uid != 0 or identification.hardware_uid.strip("0")
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def product_is_told(drone: Drone) -> None:
     """Info.get_product: vendor and product of the autopilot."""
     product = await drone.info.get_product()
@@ -37,12 +36,12 @@ async def product_is_told(drone: Drone) -> None:
 async def speed_factor_is_that_of_the_simulation(drone: Drone) -> None:
     """Info.get_speed_factor: "a simulation can run faster or slower than realtime"."""
     info = drone.info  # hears the clock from here on, and smooths
-    async with asyncio.timeout(drone.limit_s):
-        while True:
-            await drone.take(drone.telemetry.subscribe_attitude_euler(), 20)
-            factor = await info.get_speed_factor()
-            if 0.75 * drone.speed < factor < 1.25 * drone.speed:
-                return
+
+    async def right() -> bool:
+        return bool(0.75 * drone.speed < await info.get_speed_factor() < 1.25 * drone.speed)
+
+    await drone.take(drone.telemetry.subscribe_attitude_euler(), 20)
+    await drone.poll(right)
 
 
 @case(AIR)

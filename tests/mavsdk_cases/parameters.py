@@ -7,7 +7,7 @@ from mavsdk.plugins.offboard import VelocityNedYaw
 from mavsdk_cases.harness import AIR, GROUND, Drone, case, refused
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def an_int_is_an_int_and_a_float_a_float(drone: Drone) -> None:
     """get_param_int, get_param_float: "If the type is wrong, the result will be `WRONG_TYPE`"."""
     assert 0 <= await drone.param.get_param_int("COM_OBL_RC_ACT") <= 7
@@ -18,7 +18,7 @@ async def an_int_is_an_int_and_a_float_a_float(drone: Drone) -> None:
         await drone.param.get_param_int("COM_OF_LOSS_T")
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def all_parameters_are_listed(drone: Drone) -> None:
     """get_all_params lists what get_param_* then reads, of both types."""
     every = await drone.param.get_all_params()
@@ -32,14 +32,14 @@ async def all_parameters_are_listed(drone: Drone) -> None:
         assert await drone.param.get_param_int(name) == ints[name]
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def an_unknown_name_is_an_error(drone: Drone) -> None:
     """get_param_float of a name that the vehicle has not."""
     with refused("TIMEOUT", "DOES_NOT_EXIST"):
         await drone.param.get_param_float("NO_SUCH_PARAM")
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def a_value_out_of_range_changes_nothing(drone: Drone) -> None:
     """A refused set_param_* leaves the old value, whether or not the client is told."""
     before = await drone.param.get_param_float("COM_OF_LOSS_T")

@@ -80,22 +80,40 @@ def attempt_blocking(case: Case, port: int) -> None:
 
 
 def fly(cases: list[Case], folder: Path) -> dict[str, BaseException | None]:
-    """Run cases against simulators, each with its own and a few at a time; what each of them raised."""
+    """Run cases against simulators, a few at a time; what each of them raised.
+
+    Each has a simulator of its own, but for those that leave the vehicle as they found it: they share one.
+    """
+    raised: dict[str, BaseException | None] = {}
     places = asyncio.Semaphore(_SIMULATORS)
 
-    async def one(case: Case) -> None:
+    async def one_after_the_other(group: list[Case]) -> None:
         async with places:
-            process, port = simulator(case, folder)
+            process, port = simulator(group[0], folder)
             try:
-                await attempt(case, port, process)
+                for case in group:
+                    (raised[case.name],) = await asyncio.gather(attempt(case, port, process), return_exceptions=True)
             finally:
                 end(process)
 
-    async def all_of_them() -> list[BaseException | None]:
+    async def all_of_them() -> None:
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(max_workers=12 * _SIMULATORS))
-        return await asyncio.gather(*map(one, cases), return_exceptions=True)
+        await asyncio.gather(*map(one_after_the_other, _groups(cases)))
 
-    return dict(zip([case.name for case in cases], asyncio.run(all_of_them()), strict=True))
+    asyncio.run(all_of_them())
+    return raised
+
+
+def _groups(cases: list[Case]) -> list[list[Case]]:
+    """Cases that can share a simulator together, the others alone."""
+    shared: dict[tuple[str, float, str], list[Case]] = {}
+    alone = []
+    for case in cases:
+        if case.alters:
+            alone.append([case])
+        else:
+            shared.setdefault((case.vehicle, case.speed, case.more), []).append(case)
+    return [*shared.values(), *alone]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from mavsdk_cases.harness import AIR, GROUND, Drone, case, refused
 REFUSED = ("UNSUPPORTED", "DENIED", "ERROR", "UNSUPPORTED_MISSION_CMD", "INT_MESSAGES_NOT_SUPPORTED")
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def a_mission_is_refused(drone: Drone) -> None:
     """Mission.upload_mission: "The mission items are uploaded to a drone. Once uploaded the mission can be started"."""
     mission = MissionAsync(drone.system)
@@ -23,7 +23,7 @@ async def a_mission_is_refused(drone: Drone) -> None:
         await mission.upload_mission(MissionPlan(items))
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def a_fence_is_refused(drone: Drone) -> None:
     """Geofence.upload_geofence: "Polygon and Circular geofences are uploaded to a drone"."""
     geofence = GeofenceAsync(drone.system)

@@ -16,7 +16,7 @@ async def rate_hz(drone: Drone, stream: Callable[[], Any], stamp_us: Callable[[A
     return count * 1e6 / (stamps[-1] - stamps[0])
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def rate_of_the_attitude(drone: Drone) -> None:
     """set_rate_attitude_quaternion: 40 Hz, then 5 Hz."""
 
@@ -30,21 +30,21 @@ async def rate_of_the_attitude(drone: Drone) -> None:
     assert 4.0 < await seen_hz(8) < 6.0
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def rate_of_the_odometry(drone: Drone) -> None:
     """set_rate_odometry: 10 Hz."""
     await drone.telemetry.set_rate_odometry(10.0)
     assert 9.0 < await rate_hz(drone, drone.telemetry.subscribe_odometry, lambda o: o.time_usec, 20) < 11.0
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def rate_of_the_raw_gps(drone: Drone) -> None:
     """set_rate_raw_gps: 8 Hz."""
     await drone.telemetry.set_rate_raw_gps(8.0)
     assert 7.0 < await rate_hz(drone, drone.telemetry.subscribe_raw_gps, lambda gps: gps.timestamp_us, 16) < 9.0
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def rate_of_the_position(drone: Drone) -> None:
     """set_rate_position: 20 Hz, measured against the attitude at 10 Hz, for a position has no stamp."""
     await drone.telemetry.set_rate_position(20.0)
@@ -56,7 +56,7 @@ async def rate_of_the_position(drone: Drone) -> None:
         assert 30 < len(positions) - before < 50
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def the_rate_of_what_is_not_there_is_refused(drone: Drone) -> None:
     """set_rate_distance_sensor: a TelemetryError "contains the reason for the failure"; there is no such sensor."""
     with refused("COMMAND_DENIED", "UNSUPPORTED", "UNKNOWN"):

@@ -179,7 +179,7 @@ async def altitude_counts_from_sea_from_home_and_from_the_origin(drone: Drone) -
         assert abs(getattr(higher[-1], name) - getattr(start, name) - 1.4) < 0.25, name
 
 
-@case(GROUND)
+@case(GROUND, alters=False)
 async def origin_of_the_local_frame_is_told(drone: Drone) -> None:
     """Telemetry.get_gps_global_origin: "the GPS location of where the estimator has been initialized"."""
     home = await drone.next(drone.telemetry.subscribe_home())
