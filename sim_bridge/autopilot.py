@@ -8,36 +8,43 @@ during the mode), "Takeoff", "Land" (auto-disarm), and COM_OF_LOSS_T, COM_OBL_RC
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from sim_bridge.controller import AccelerationSetpoint, MotorsOff, PositionSetpoint, Setpoint
 from sim_bridge.messages import (
     FORCE_DISARM,
+    HOME_ALTITUDE_AMSL_M,
     NS_PER_S,
     Ack,
+    AttitudeTarget,
     Cmd,
     Command,
     Landed,
+    LinkName,
     LocalSetpoint,
     Mode,
     Reply,
     Result,
     Severity,
+    Sticks,
     Text,
     Vec3,
 )
 from sim_bridge.parameters import Parameters
+from sim_bridge.personality import BatteryReading
 from sim_bridge.physics import BodyState
 from sim_bridge.setpoints import YAW_IGNORED, YAW_RATE_IGNORED
 from sim_bridge.stream import SetpointStream, acceleration
 
-HOME_ALTITUDE_AMSL_M = 488.0  # PX4 SITL's home, Zurich
 LANDED_NS = NS_PER_S // 2  # at rest on the ground for this long
 HOVER_NS = NS_PER_S // 2
 REST_M_S = 0.1
 TOUCH_M = 0.03  # above resting height: still on the ground
 ARRIVED_M = 0.05
 LIFT_OFF_M_S2 = 0.2  # offboard setpoints with more upward acceleration leave the ground
+
+ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT = 31, 32, 33
+_SLOW_HZ: Mapping[int, float] = {0: 1.0, 245: 5.0, 1: 1.0, 242: 1.0, 49: 0.2, 24: 1.0, 147: 0.5}
 
 _REQUESTABLE = (Mode.HOLD, Mode.TAKEOFF, Mode.LAND, Mode.POSITION, Mode.OFFBOARD)
 
@@ -50,9 +57,25 @@ class Autopilot:
             altitudes count, is the ground z = 0 below [m].
         rest_height_m: height of the vehicle's centre above the ground when it stands.
         yaw_rad: initial heading, counter-clockwise from east.
+        control_hz: the rate of the state on the onboard link.
+        physics_hz: the fastest stream.
     """
 
-    def __init__(self, *, start_enu: Vec3, rest_height_m: float, yaw_rad: float) -> None:
+    kind = 12  # MAV_AUTOPILOT_PX4
+    capabilities = 2 | 8 | 16 | 128 | 8192  # float and bytewise parameters, COMMAND_INT, local setpoints, MAVLink 2
+    version = 1 << 24 | 15 << 16 | 255  # 1.15.0, release
+
+    def __init__(
+        self,
+        *,
+        start_enu: Vec3,
+        rest_height_m: float,
+        yaw_rad: float,
+        control_hz: int = 20,
+        physics_hz: int = 240,
+    ) -> None:
+        self.max_rate_hz = float(physics_hz)
+        self._control_hz = float(control_hz)
         airborne = start_enu[2] > rest_height_m + TOUCH_M
         self.parameters = Parameters()
         self.home_enu: Vec3 = (start_enu[0], start_enu[1], 0.0)
@@ -86,6 +109,47 @@ class Autopilot:
     def setpoint(self, setpoint: LocalSetpoint, t_ns: int) -> tuple[Reply, ...]:
         """Take an external setpoint; one that cannot be flown is dropped whole and does not count as stream."""
         return self._stream.take(setpoint, t_ns)
+
+    def attitude_setpoint(self, setpoint: AttitudeTarget, t_ns: int) -> tuple[Reply, ...]:
+        return ()
+
+    def manual(self, sticks: Sticks, t_ns: int) -> tuple[Reply, ...]:
+        return ()
+
+    def heard_station(self, t_ns: int) -> None:
+        pass
+
+    def battery(self, reading: BatteryReading) -> None:
+        pass
+
+    @property
+    def custom_mode(self) -> int:
+        return int(self.mode)
+
+    @property
+    def base_mode(self) -> int:
+        base = 1 | 8 * (self.mode is Mode.OFFBOARD) | 4 * (self.mode is not Mode.MANUAL) | 16
+        return base | (128 if self.armed else 0)
+
+    @property
+    def system_status(self) -> int:
+        return 4 if self.armed else 3
+
+    @property
+    def mode_name(self) -> str:
+        return self.mode.name
+
+    @property
+    def external(self) -> bool:
+        return self.mode is Mode.OFFBOARD
+
+    def position_target(self) -> LocalSetpoint | None:
+        return self.last_setpoint
+
+    def rates_hz(self, link: LinkName) -> Mapping[int, float]:
+        if link is LinkName.ONBOARD:
+            return {**_SLOW_HZ, ATTITUDE_QUATERNION: self._control_hz, LOCAL_POSITION_NED: self._control_hz}
+        return {**_SLOW_HZ, ATTITUDE_QUATERNION: 10.0, LOCAL_POSITION_NED: 10.0, GLOBAL_POSITION_INT: 5.0}
 
     @property
     def last_setpoint(self) -> LocalSetpoint | None:

@@ -10,11 +10,10 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Iterator
-from enum import Enum
 from typing import TypeAlias
 
-from sim_bridge.mavlink import ID, Decoder, Encoder, Packet
-from sim_bridge.messages import Sender
+from sim_bridge.mavlink import COMPONENT, Decoder, Encoder, Packet
+from sim_bridge.messages import LinkName, Sender
 
 TIMESYNC = 111
 _DATAGRAM = 65535
@@ -24,18 +23,13 @@ _PEERS = 8
 Address: TypeAlias = tuple[str, int]
 
 
-class LinkName(Enum):
-    ONBOARD = "onboard"
-    GROUND = "ground station"
-
-
 class Link:
     """One UDP endpoint: who listens there, whom we heard, our numbering of messages."""
 
-    def __init__(self, name: LinkName, port: int, host: str = "127.0.0.1") -> None:
+    def __init__(self, name: LinkName, port: int, host: str = "127.0.0.1", *, system: int = 1) -> None:
         self.name = name
         self.port = port
-        self.encoder = Encoder()
+        self.encoder = Encoder(system)
         self.heard: set[Sender] = set()
         self._home: Address = (host, port)
         self._peers: list[Address] = []
@@ -79,11 +73,12 @@ class Link:
 
 
 class Router:
-    """The two links together."""
+    """The two links of the autopilot of one vehicle, together; ``system`` is its MAVLink system id."""
 
-    def __init__(self, onboard_port: int, ground_port: int) -> None:
-        self.onboard = Link(LinkName.ONBOARD, onboard_port)
-        self.ground = Link(LinkName.GROUND, ground_port)
+    def __init__(self, onboard_port: int, ground_port: int, *, system: int = 1) -> None:
+        self.id = Sender(system, COMPONENT)
+        self.onboard = Link(LinkName.ONBOARD, onboard_port, system=system)
+        self.ground = Link(LinkName.GROUND, ground_port, system=system)
         self.links = (self.onboard, self.ground)
 
     def other(self, link: Link) -> Link:
@@ -93,7 +88,7 @@ class Router:
         """What has arrived on both links, without waiting."""
         for link in self.links:
             for packet in link.receive():
-                if packet.sender != ID:
+                if packet.sender != self.id:
                     yield link, packet
 
     def forward(self, link: Link, packet: Packet) -> bool:
@@ -104,14 +99,13 @@ class Router:
             other.send(packet.raw)
         return passes
 
+    def for_autopilot(self, target: Sender) -> bool:
+        """Addressed to everybody, to our whole system, or to us."""
+        return target.system in (0, self.id.system) and target.component in (0, self.id.component)
+
     def close(self) -> None:
         for link in self.links:
             link.close()
-
-
-def for_autopilot(target: Sender) -> bool:
-    """Addressed to everybody, to our whole system, or to us."""
-    return target.system in (0, ID.system) and target.component in (0, ID.component)
 
 
 def _passes(packet: Packet, heard: set[Sender]) -> bool:

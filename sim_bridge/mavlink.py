@@ -1,7 +1,7 @@
 """MAVLink 2 to the autopilot's values and back; the only place of the simulator where NED and FRD exist.
 
 pymavlink's generated dialect is the codec, no socket and no ``mavutil``. A vector: (x, y, z) ENU <-> (y, x, -z) NED;
-a heading: pi/2 - yaw. System 1, component 1, as PX4's first SITL instance.
+a heading: pi/2 - yaw. The autopilot is component 1 of its system.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from sim_bridge.messages import (
     Vec3,
 )
 
-SYSTEM, COMPONENT = 1, 1
-ID = Sender(SYSTEM, COMPONENT)
+COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
 _V1, _V2, _SIGNED = 0xFE, 0xFD, 0x01
 _INT_TYPES = range(1, 9)  # MAV_PARAM_TYPE UINT8 .. INT64
 _PARAM_INT32, _PARAM_REAL32 = 6, 9
@@ -162,10 +161,10 @@ _READERS: dict[str, Callable[[Any, Sender], Incoming | None]] = {
 
 
 class Encoder:
-    """Values to bytes, numbered for one link."""
+    """Values to bytes, from the autopilot of ``system``, numbered for one link."""
 
-    def __init__(self) -> None:
-        self._mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    def __init__(self, system: int = 1) -> None:
+        self._mav = dialect.MAVLink(None, srcSystem=system, srcComponent=COMPONENT)
 
     def pack(self, message: Any) -> bytes:
         """Bytes of a pymavlink message object with this link's next sequence number."""

@@ -6,12 +6,20 @@ Numbers are those of MAVLink's common dialect (MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum
 from typing import TypeAlias
 
 Vec3: TypeAlias = tuple[float, float, float]
 
 NS_PER_S = 1_000_000_000
+HOME_ALTITUDE_AMSL_M = 488.0  # PX4 SITL's home, Zurich: the local origin
+
+
+class LinkName(Enum):
+    """The autopilot's two links."""
+
+    ONBOARD = "onboard"
+    GROUND = "ground station"
 
 
 class Mode(IntEnum):
@@ -103,6 +111,36 @@ class LocalSetpoint:
 
 
 @dataclass(frozen=True, slots=True)
+class AttitudeTarget:
+    """SET_ATTITUDE_TARGET turned into ENU and FLU. Fields that the mask ignores may hold anything."""
+
+    time_boot_ms: int
+    type_mask: int  # ATTITUDE_TARGET_TYPEMASK
+    q_wxyz: tuple[float, float, float, float]  # enu_from_flu
+    omega_flu: Vec3  # [rad/s]
+    thrust: float  # collective, share of full thrust
+    sender: Sender = Sender(0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Sticks:
+    """MANUAL_CONTROL or RC_CHANNELS_OVERRIDE: a pilot's sticks, each -1 to 1, centred at 0."""
+
+    forward: float
+    left: float
+    up: float  # throttle stick
+    turn_left: float  # yaw stick, counter-clockwise
+    sender: Sender = Sender(0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class StationHeartbeat:
+    """A HEARTBEAT of a ground station (MAV_TYPE_GCS)."""
+
+    sender: Sender
+
+
+@dataclass(frozen=True, slots=True)
 class Timesync:
     """A request (tc1 = 0) of a peer that wants our clock."""
 
@@ -126,7 +164,9 @@ class ParamWrite:
     is_int: bool
 
 
-Incoming: TypeAlias = Command | LocalSetpoint | Timesync | ParamRead | ParamWrite
+Incoming: TypeAlias = (
+    Command | LocalSetpoint | AttitudeTarget | Sticks | StationHeartbeat | Timesync | ParamRead | ParamWrite
+)
 
 
 @dataclass(frozen=True, slots=True)

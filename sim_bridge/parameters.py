@@ -44,6 +44,11 @@ class Parameters:
     def __init__(self) -> None:
         self._values: dict[str, float | int] = {name: DEFINITIONS[name].default for name in NAMES}
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """In the order of their index on the wire."""
+        return NAMES
+
     def __getitem__(self, name: str) -> float | int:
         return self._values[name]
 

@@ -19,6 +19,7 @@ from sim_bridge.scenario import (
     Obstacle,
     OperatorStep,
     Scenario,
+    Vehicle,
 )
 
 
@@ -48,9 +49,10 @@ class Resolved:
     def period_ns(self) -> int:
         return 1000 // self.scenario.control_hz * 1_000_000
 
-    def sensor_rng(self, index: int) -> np.random.Generator:
-        """The generator of sensor ``index``: independent of the obstacles' jitter and of other sensors."""
-        return np.random.default_rng([self.seed, 1, index])
+    def sensor_rng(self, index: int, vehicle: int = 0) -> np.random.Generator:
+        """The generator of sensor ``index`` on vehicle ``vehicle`` (indices in the file): independent of the
+        obstacles' jitter, of other sensors and of other vehicles."""
+        return np.random.default_rng([self.seed, 1, index, vehicle] if vehicle else [self.seed, 1, index])
 
 
 def resolve(name: str, scenario: Scenario, seed: int, *, obstacles: bool = True) -> Resolved:
@@ -64,14 +66,14 @@ def describe(resolved: Resolved, vehicle_name: str) -> dict[str, Any]:
     """What `sim-bridge scenario --json` prints: all that the other side of the wires has to know."""
     scenario = resolved.scenario
     described: dict[str, Any] = msgspec.to_builtins(scenario)
-    target = scenario.target
     described |= {
         "name": resolved.name,
         "seed": resolved.seed,
         "prefix": f"uav/{vehicle_name}",
+        "fleet": [_described(scenario, vehicle) for vehicle in scenario.fleet],
         "start": scenario.vehicle.start,
         "takeoff_altitude_m": scenario.vehicle.takeoff_altitude_m,
-        "target": None if target is None else target.position,
+        "target": scenario.target_of(scenario.vehicle),
         "sources": [sensor.source for sensor in scenario.sensors],
         "obstacles": [
             {
@@ -85,6 +87,21 @@ def describe(resolved: Resolved, vehicle_name: str) -> dict[str, Any]:
         ],
     }
     return described
+
+
+def _described(scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
+    """What one vehicle's daemon and operator have to know."""
+    return {
+        "name": vehicle.name,
+        "system_id": vehicle.system_id,
+        "prefix": f"uav/{vehicle.name}",
+        "personality": vehicle.personality,
+        "start": vehicle.start,
+        "takeoff_altitude_m": vehicle.takeoff_altitude_m,
+        "target": scenario.target_of(vehicle),
+        "sources": [sensor.source for _, sensor in scenario.carried(vehicle.name)],
+        "daemon": vehicle.daemon,
+    }
 
 
 def step_command(step: OperatorStep) -> tuple[int, int, float | None]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
-from sim_bridge.flight import Flight
-from sim_bridge.links import Link, Router, for_autopilot
+from sim_bridge.links import Link, Router
 from sim_bridge.mavlink import Packet
 from sim_bridge.messages import (
     Ack,
+    AttitudeTarget,
     Cmd,
     Command,
     LocalSetpoint,
@@ -16,10 +17,13 @@ from sim_bridge.messages import (
     ParamWrite,
     Reply,
     Result,
+    StationHeartbeat,
+    Sticks,
     Text,
     Timesync,
 )
-from sim_bridge.parameters import NAMES
+from sim_bridge.personality import Personality
+from sim_bridge.physics import BodyState
 from sim_bridge.telemetry import (
     ATTITUDE_QUATERNION,
     BUILDERS,
@@ -29,41 +33,69 @@ from sim_bridge.telemetry import (
     Moment,
     Streams,
     build,
-    ground_rates_hz,
-    onboard_rates_hz,
 )
 
 _LOCKSTEP_PINNED = frozenset({HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED})
 
 
+class Vehicle(Protocol):
+    """What a station needs of one vehicle of a flight."""
+
+    @property
+    def autopilot(self) -> Personality: ...
+
+    @property
+    def state(self) -> BodyState:
+        """What its estimator believes."""
+
+
 class Station:
-    """What the two links see of one flight.
+    """What the two links see of one vehicle.
 
     Args:
+        t_ns: the vehicle's time, that of its telemetry.
         clock_ns: the vehicle's clock now, for TIMESYNC (finer than physics steps in real time).
         lockstep: pins the heartbeat and the state messages to their default rates.
     """
 
-    def __init__(self, flight: Flight, router: Router, *, clock_ns: Callable[[], int], lockstep: bool) -> None:
-        self._flight = flight
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        router: Router,
+        *,
+        t_ns: Callable[[], int],
+        clock_ns: Callable[[], int],
+        lockstep: bool,
+    ) -> None:
+        self._vehicle = vehicle
+        self._autopilot = vehicle.autopilot
         self._router = router
+        self._t_ns = t_ns
         self._clock_ns = clock_ns
-        scenario = flight.resolved.scenario
-        pinned = _LOCKSTEP_PINNED if lockstep else frozenset()
         self._streams = {
-            router.onboard: Streams(onboard_rates_hz(scenario.control_hz), max_hz=scenario.physics_hz, pinned=pinned),
-            router.ground: Streams(ground_rates_hz(), max_hz=scenario.physics_hz),
+            link: Streams(
+                self._autopilot.rates_hz(link.name),
+                max_hz=self._autopilot.max_rate_hz,
+                pinned=_LOCKSTEP_PINNED if lockstep and link is router.onboard else frozenset(),
+            )
+            for link in router.links
         }
         self._announced = self._status()
 
     def handle(self, link: Link, packet: Packet) -> tuple[Reply, ...]:
         """Act on what is meant for the autopilot, answer on the link it came from; returns the answers."""
         content = packet.content
-        if content is None or not for_autopilot(packet.target):
+        if content is None or not self._router.for_autopilot(packet.target):
             return ()
         replies: tuple[Reply, ...] = ()
         if isinstance(content, LocalSetpoint):
-            replies = self._flight.autopilot.setpoint(content, self._flight.t_ns)
+            replies = self._autopilot.setpoint(content, self._t_ns())
+        elif isinstance(content, AttitudeTarget):
+            replies = self._autopilot.attitude_setpoint(content, self._t_ns())
+        elif isinstance(content, Sticks):
+            replies = self._autopilot.manual(content, self._t_ns())
+        elif isinstance(content, StationHeartbeat):
+            self._autopilot.heard_station(self._t_ns())
         elif isinstance(content, Command):
             replies = self._command(link, content)
         elif isinstance(content, Timesync):
@@ -98,7 +130,7 @@ class Station:
 
     def stream(self, *links: Link) -> None:
         """Send what is due on each of ``links``, one datagram a link."""
-        t_ns = self._flight.t_ns
+        t_ns = self._t_ns()
         for link in links:
             due = self._streams[link].due(t_ns)
             if due:
@@ -121,17 +153,17 @@ class Station:
         link.send(build(message_id, now, link.encoder))
 
     def _moment(self) -> Moment:
-        return Moment(self._flight.t_ns, self._flight.state, self._flight.autopilot)
+        return Moment(self._t_ns(), self._vehicle.state, self._autopilot, self._router.id.system)
 
     def _status(self) -> tuple[int, bool, int]:
-        autopilot = self._flight.autopilot
-        return (int(autopilot.mode), autopilot.armed, int(autopilot.landed))
+        autopilot = self._autopilot
+        return (autopilot.custom_mode, autopilot.armed, int(autopilot.landed))
 
     def _command(self, link: Link, command: Command) -> tuple[Reply, ...]:
         streams = self._streams[link]
         message_id = int(command.params[0]) if abs(command.params[0]) < 1 << 24 else -1
         if command.command == Cmd.SET_MESSAGE_INTERVAL:
-            granted = streams.request(message_id, command.params[1], self._flight.t_ns)
+            granted = streams.request(message_id, command.params[1], self._t_ns())
         elif command.command == Cmd.GET_MESSAGE_INTERVAL:
             link.send(link.encoder.message_interval(message_id & 0xFFFF, streams.interval_us(message_id)))
             granted = message_id in BUILDERS
@@ -140,27 +172,28 @@ class Station:
             if granted:
                 self._send_one(link, message_id, self._moment())
         else:
-            return self._flight.autopilot.command(command, self._flight.state, self._flight.t_ns)
+            return self._autopilot.command(command, self._vehicle.state, self._t_ns())
         return (Ack(command.command, Result.ACCEPTED if granted else Result.DENIED, command.sender),)
 
     def _read_parameters(self, link: Link, wanted: ParamRead) -> None:
+        known = self._autopilot.parameters.names
         if wanted.name:
-            names: tuple[str, ...] = (wanted.name,) if wanted.name in NAMES else ()
+            names: tuple[str, ...] = (wanted.name,) if wanted.name in known else ()
         elif wanted.index >= 0:
-            names = NAMES[wanted.index : wanted.index + 1]
+            names = known[wanted.index : wanted.index + 1]
         else:
-            names = NAMES
+            names = known
         for name in names:
             link.send(self._param_value(link, name))
 
     def _write_parameter(self, wanted: ParamWrite) -> None:
         """The new value, or the unchanged one where it was refused, goes to everybody."""
-        if wanted.name not in NAMES:
+        if wanted.name not in self._autopilot.parameters.names:
             return
-        self._flight.autopilot.parameters.write(wanted.name, wanted.value, is_int=wanted.is_int)
+        self._autopilot.parameters.write(wanted.name, wanted.value, is_int=wanted.is_int)
         for link in self._router.links:
             link.send(self._param_value(link, wanted.name))
 
     def _param_value(self, link: Link, name: str) -> bytes:
-        value = self._flight.autopilot.parameters[name]
-        return link.encoder.param(name, value, NAMES.index(name), len(NAMES))
+        names = self._autopilot.parameters.names
+        return link.encoder.param(name, self._autopilot.parameters[name], names.index(name), len(names))

@@ -13,9 +13,9 @@ from typing import Any, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sim_bridge.autopilot import HOME_ALTITUDE_AMSL_M, Autopilot
 from sim_bridge.mavlink import Encoder, q_ned_from_frd, swap_ned_enu
-from sim_bridge.messages import Mode
+from sim_bridge.messages import HOME_ALTITUDE_AMSL_M
+from sim_bridge.personality import Personality
 from sim_bridge.physics import BodyState
 
 HEARTBEAT, SYS_STATUS, GPS_RAW_INT, LOCAL_POSITION_NED, GLOBAL_POSITION_INT = 0, 1, 24, 32, 33
@@ -26,7 +26,6 @@ Message: TypeAlias = Any  # dialect.MAVLink_message; pymavlink is untyped
 
 # gyro, accelerometer, magnetometer, pressure, GPS, attitude, yaw, altitude, position, motors, battery, PREARM_CHECK
 _HEALTH = 0b1111 | 1 << 5 | 0b11111 << 11 | 1 << 25 | 1 << 28
-_CAPABILITIES = 2 | 8 | 16 | 128 | 8192  # float and bytewise parameters, COMMAND_INT, local setpoints, MAVLink 2
 _LAT0_DEG, _LON0_DEG = 47.397742, 8.545594  # PX4 SITL's home, Zurich
 _M_PER_DEG = 6371000.0 * math.pi / 180.0
 _MV_FULL = 4100
@@ -39,7 +38,8 @@ class Moment:
 
     t_ns: int
     state: BodyState
-    autopilot: Autopilot
+    autopilot: Personality
+    system: int = 1
 
     @property
     def t_ms(self) -> int:
@@ -47,10 +47,9 @@ class Moment:
 
 
 def heartbeat(now: Moment) -> Message:
-    armed = now.autopilot.armed
-    base = 1 | 8 * (now.autopilot.mode is Mode.OFFBOARD) | 4 * (now.autopilot.mode is not Mode.MANUAL) | 16
+    autopilot = now.autopilot
     return dialect.MAVLink_heartbeat_message(
-        2, 12, base | (128 if armed else 0), int(now.autopilot.mode), 4 if armed else 3, 3
+        2, autopilot.kind, autopilot.base_mode, autopilot.custom_mode, autopilot.system_status, 3
     )
 
 
@@ -114,8 +113,8 @@ def gps_raw_int(now: Moment) -> Message:
 
 
 def position_target(now: Moment) -> Message:
-    """The last accepted setpoint as it was understood, None before there is one."""
-    setpoint = now.autopilot.last_setpoint
+    """What is flown, None where there is nothing to tell."""
+    setpoint = now.autopilot.position_target()
     if setpoint is None:
         return None
     return dialect.MAVLink_position_target_local_ned_message(
@@ -131,10 +130,10 @@ def position_target(now: Moment) -> Message:
 
 
 def autopilot_version(now: Moment) -> Message:
-    version = 1 << 24 | 15 << 16 | 255  # 1.15.0, release
+    version = now.autopilot.version
     blank = [0] * 8
     return dialect.MAVLink_autopilot_version_message(
-        _CAPABILITIES, version, version, 0, 0, blank, blank, blank, 0x26AC, 1, 1
+        now.autopilot.capabilities, version, version, 0, 0, blank, blank, blank, 0x26AC, 1, now.system
     )
 
 
@@ -160,26 +159,6 @@ BUILDERS: Mapping[int, Callable[[Moment], Message]] = {
     LOCAL_POSITION_NED: local_position_ned,  # last: it is what a companion answers
 }
 ALIVE = (HEARTBEAT, EXTENDED_SYS_STATE, SYS_STATUS, HOME_POSITION)  # what a ground station needs to find us healthy
-
-_SLOW_HZ: Mapping[int, float] = {
-    HEARTBEAT: 1.0,
-    EXTENDED_SYS_STATE: 5.0,
-    SYS_STATUS: 1.0,
-    HOME_POSITION: 1.0,
-    GPS_GLOBAL_ORIGIN: 0.2,
-    GPS_RAW_INT: 1.0,
-    BATTERY_STATUS: 0.5,
-}
-
-
-def onboard_rates_hz(control_hz: int) -> dict[int, float]:
-    """Default streams of the onboard link: the state at the control rate."""
-    return {**_SLOW_HZ, ATTITUDE_QUATERNION: control_hz, LOCAL_POSITION_NED: control_hz}
-
-
-def ground_rates_hz() -> dict[int, float]:
-    """Default streams of the ground station link."""
-    return {**_SLOW_HZ, ATTITUDE_QUATERNION: 10.0, LOCAL_POSITION_NED: 10.0, GLOBAL_POSITION_INT: 5.0}
 
 
 class Streams:

@@ -55,9 +55,12 @@ class Bench:
         self.companion, self.ground = Peer(1, 196), Peer(245, 190)
         self.flight = Flight(resolve("bench", parse_scenario(AIRBORNE, source="bench"), 0))
         self.router = Router(self.companion.port, self.ground.port)
-        self.station = Station(self.flight, self.router, clock_ns=lambda: self.flight.t_ns, lockstep=False)
+        self.station = Station(self.flight, self.router, t_ns=self.t_ns, clock_ns=self.t_ns, lockstep=False)
         self.onboard_link, self.ground_link = self.router.links
         self.station.stream(*self.router.links)
+
+    def t_ns(self) -> int:
+        return self.flight.t_ns
 
     def serve(self) -> None:
         for link, packet in self.router.receive():
