@@ -7,9 +7,10 @@ flies what the law answers, tick by tick.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
-from sim_bridge import physics
+from sim_bridge import body, physics
 from sim_bridge.flight import Flight
 from sim_bridge.messages import NS_PER_S, Cmd, Command, LocalSetpoint, Sender, Vec3
 from sim_bridge.placement import Resolved
@@ -40,7 +41,8 @@ def fly(flight: Flight, law: Law, seconds: float) -> list[int]:
 def tick(flight: Flight, law: Law) -> None:
     """One control period: frames, the law's answer, the autopilot, its physics steps."""
     t_ns = flight.t_ns
-    frames = [frame for spec in flight.resolved.scenario.sensors for frame in flight.frames(spec.source, t_ns)]
+    craft = flight.crafts[0]
+    frames = [frame for source in craft.sensors for frame in craft.frames(source, t_ns)]
     setpoint = LocalSetpoint(
         time_boot_ms=t_ns // 1_000_000,
         frame=1,
@@ -52,7 +54,7 @@ def tick(flight: Flight, law: Law) -> None:
         yaw_rate_rad_s=0.0,
         sender=_COMPANION,
     )
-    flight.autopilot.setpoint(setpoint, t_ns)
+    craft.autopilot.setpoint(setpoint, t_ns)
     flight.control()
     for _ in range(flight.resolved.control_steps):
         flight.advance()
@@ -78,27 +80,40 @@ def measure(
     ticks_ns = fly(flight, law, seconds)
     flight.close()
     sections = Sections()
-    flight = sectioned_flight(sections, resolved)
-    law = claim(sections, make_law())
-    fly(flight, law, 1.0)
-    sections.start()
-    spent = sections.ms_per(len(fly(flight, law, min(seconds, 10.0))) + LEAD_TICKS)
-    flight.close()
+    with sectioned(sections, resolved) as flight:
+        law = claim(sections, make_law())
+        fly(flight, law, 1.0)
+        sections.start()
+        spent = sections.ms_per(len(fly(flight, law, min(seconds, 10.0))) + LEAD_TICKS)
     factor = len(ticks_ns) / resolved.scenario.control_hz * NS_PER_S / sum(ticks_ns)
     return case(name, ticks_ns, factor, demand=demand, sections=spent)
 
 
-def sectioned_flight(sections: Sections, resolved: Resolved) -> Flight:
-    """A flight whose parts count their time."""
+@contextmanager
+def sectioned(sections: Sections, resolved: Resolved) -> Iterator[Flight]:
+    """A flight whose parts count their time; PyBullet's calls of this process do meanwhile."""
+    modules = (body, physics)
     plain = physics.pybullet
-    physics.pybullet = sections.module("PyBullet", plain)
+    for module in modules:
+        module.pybullet = sections.module("PyBullet", plain)  # type: ignore[attr-defined]
     try:
         flight = Flight(resolved)
+        try:
+            sections.wrap(flight, "flight", "advance")
+            sections.wrap(flight.world, "physics around PyBullet", "step")
+            for craft in flight.crafts:
+                sections.wrap(craft, "controller", "command")
+                sections.wrap(craft, "autopilot", "control")
+                sections.wrap(craft, "sensors and judge", "follow", "frames")
+            yield flight
+        finally:
+            flight.close()
     finally:
-        physics.pybullet = plain
-    return flight
+        for module in modules:
+            module.pybullet = plain  # type: ignore[attr-defined]
 
 
 def _enter_offboard(flight: Flight) -> None:
+    craft = flight.crafts[0]
     command = Command(int(Cmd.DO_SET_MODE), (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0), _COMPANION)
-    flight.autopilot.command(command, flight.state, flight.t_ns)
+    craft.autopilot.command(command, craft.state, flight.t_ns)

@@ -1,0 +1,195 @@
+"""The bench's case over real sockets: this process is the simulator, the daemon a subprocess, as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from sim_bridge.errors import SimError
+from sim_bridge.flight import Flight
+from sim_bridge.inprocess import sectioned
+from sim_bridge.lockstep_runner import Lockstep
+from sim_bridge.placement import Resolved
+from sim_bridge.runner import Trace, Wires
+from sim_bridge.sections import Case, Sections, case
+from sim_bridge.zenoh_io import Record
+
+STOP_S = 10.0  # the daemon is given this long to end
+_ENGAGE = 92  # MAV_CMD_NAV_GUIDED_ENABLE
+_COMPANION = 196
+
+
+def measure_lockstep(
+    name: str, resolved: Resolved, *, demand: float, settings: Sequence[str] = (), sections: bool = True
+) -> Case:
+    """Ticks from the entry into offboard to the scenario's end, and a second flight for where the time goes.
+
+    Args:
+        settings: of the daemon, each KEY=VALUE.
+        sections: fly that second flight.
+    Raises:
+        SimError: the daemon did not start, or lockstep stalled.
+    """
+    flight = Flight(resolved)
+    try:
+        with _daemon(resolved, settings) as ports:
+            ticks_ns, factor, _ = _fly(flight, ports, _noting_ticks)
+    finally:
+        flight.close()
+    spent: dict[str, float] = {}
+    if sections:
+        counted = Sections()
+        with sectioned(counted, resolved) as flight, _daemon(resolved, settings) as ports:
+            noted, _, daemon_ms = _fly(flight, ports, lambda runner, wires: _counting(counted, runner, wires))
+            spent = counted.ms_per(len(noted)) | daemon_ms
+    return case(name, ticks_ns, factor, demand=demand, sections=spent)
+
+
+Ports = tuple[int, int, str]  # onboard, ground station, Zenoh endpoint
+Noting = Callable[[Lockstep, Wires], list[int]]
+
+
+def _fly(flight: Flight, ports: Ports, prepare: Noting) -> tuple[list[int], float, dict[str, float]]:
+    """The ticks [ns] that ``prepare`` notes, the real-time factor, the daemon's own times [ms, medians]."""
+    onboard, ground, endpoint = ports
+    prefix = flight.crafts[0].prefix
+    wires = Wires(
+        flight.resolved, onboard_port=onboard, ground_port=ground, endpoint=endpoint, prefix=prefix, lockstep=True
+    )
+    try:
+        _engage(wires.router.ground.socket.getsockname())
+        runner = Lockstep(flight, wires, trace=Trace(None), progress=lambda flight: None)
+        daemon_ms = _noting_timings(wires)
+        noted = prepare(runner, wires)
+        factor = runner.run()["real_time_factor"]
+    finally:
+        wires.close()
+    if factor is None or not noted:
+        raise SimError("bench: the daemon did not fly: expected offboard until the scenario's end")
+    medians = {f"daemon: {key}": float(np.median(values)) for key, values in daemon_ms.items()}
+    return noted, factor, medians
+
+
+def _noting_ticks(runner: Lockstep, wires: Wires) -> list[int]:
+    """The time of each tick in external mode."""
+    ticks_ns: list[int] = []
+    account = runner._account
+
+    def noting(marks: list[float]) -> None:
+        if runner.flight.crafts[0].judge is not None:
+            ticks_ns.append(round((marks[-1] - marks[0]) * 1e9))
+        account(marks)
+
+    runner._account = noting  # type: ignore[method-assign]
+    return ticks_ns
+
+
+def _counting(sections: Sections, runner: Lockstep, wires: Wires) -> list[int]:
+    """As `_noting_ticks`; from the first of those ticks on, what the parts of a tick cost."""
+    assert wires.bridge is not None
+    sections.wrap(wires, "waiting for the daemon", "wait")
+    sections.wrap(wires.bridge, "Zenoh", "publish_frame", "publish_marker", "records")
+    sections.wrap(runner._station, "telemetry", "stream", "say", "announce")
+    sections.wrap(runner, "receive", "_receive")
+    for link in wires.router.links:
+        sections.wrap(link.encoder, "encode", "pack")
+        sections.wrap(link, "sockets", "send")
+    ticks_ns = _noting_ticks(runner, wires)
+    account = runner._account
+
+    def starting(marks: list[float]) -> None:
+        if not ticks_ns:
+            sections.start()
+        account(marks)
+
+    runner._account = starting  # type: ignore[method-assign]
+    return ticks_ns
+
+
+def _noting_timings(wires: Wires) -> dict[str, list[float]]:
+    """What the daemon's records say of its own time."""
+    assert wires.bridge is not None
+    noted: defaultdict[str, list[float]] = defaultdict(list)
+    records = wires.bridge.records
+
+    def noting() -> list[Record]:
+        arrived = records()
+        for record in arrived:
+            for key, value in record.timings_ms.items():
+                noted[key].append(value)
+        return arrived
+
+    wires.bridge.records = noting  # type: ignore[method-assign]
+    return noted
+
+
+def _engage(address: tuple[str, int]) -> None:
+    """The operator's one command, which lockstep keeps until its tick."""
+    codec = dialect.MAVLink(None, 245, 190)
+    message = dialect.MAVLink_command_long_message(1, _COMPANION, _ENGAGE, 0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(message.pack(codec), address)
+
+
+@contextmanager
+def _daemon(resolved: Resolved, settings: Sequence[str]) -> Iterator[Ports]:
+    """`companion run` on free ports, in lockstep with ``resolved``, until the block ends."""
+    scenario = resolved.scenario
+    onboard, ground = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
+    endpoint = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
+    position = scenario.target_of(scenario.fleet[0])
+    keys: dict[str, Any] = {
+        "mavlink.url": f"udpin://127.0.0.1:{onboard}",
+        "mavlink.system_id": 1,
+        "zenoh.connect": [endpoint],
+        "tick_hz": scenario.control_hz,
+        "sync": "lockstep",
+        "lockstep_sources": [sensor.source for sensor in scenario.sensors],
+    }
+    if position is not None:
+        keys["target.position"] = list(position)
+    with TemporaryDirectory(prefix="sim-bridge-bench-") as folder:
+        keys["log.directory"] = folder
+        config, said = Path(folder, "companion.toml"), Path(folder, "companion.log")
+        config.write_text("", encoding="utf-8")
+        words = [word for key, value in keys.items() for word in ("--set", f"{key}={json.dumps(value)}")]
+        words += [word for setting in settings for word in ("--set", setting)]
+        command = [sys.executable, "-m", "companion.cli", "run", "-c", str(config), *words]
+        with said.open("wb") as log:
+            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log)
+        try:
+            yield onboard, ground, endpoint
+        except SimError as error:
+            process.kill()
+            last = (said.read_text(errors="replace").strip().splitlines() or ["it said nothing"])[-1]
+            raise SimError(f"{error}; the daemon: {last}") from None
+        finally:
+            _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
