@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any
 
-from sim_bridge import bench
+from sim_bridge import bench, render
 from sim_bridge.errors import ScenarioError, SimError
 from sim_bridge.flight import Flight
 from sim_bridge.lockstep_runner import Lockstep
@@ -79,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_scenario(show, positional=True)
     show.set_defaults(run=_show)
     bench.add_parser(commands)
+    render.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of scenario files")
     schema.set_defaults(run=_schema)
     return parser
