@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
+import pybullet
+
 from sim_bridge import body, physics
 from sim_bridge.flight import Flight
 from sim_bridge.messages import NS_PER_S, Cmd, Command, LocalSetpoint, Sender, Vec3
@@ -93,7 +95,7 @@ def measure(
 def sectioned(sections: Sections, resolved: Resolved) -> Iterator[Flight]:
     """A flight whose parts count their time; PyBullet's calls of this process do meanwhile."""
     modules = (body, physics)
-    plain = physics.pybullet
+    plain = pybullet
     for module in modules:
         module.pybullet = sections.module("PyBullet", plain)  # type: ignore[attr-defined]
     try:

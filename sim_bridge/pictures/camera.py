@@ -115,10 +115,8 @@ def _stage(log: Log, since_s: float, until_s: float) -> Array:
     paths = np.array([pose.position for instant in shown for pose in instant.vehicles])
     goals = [pose.target for pose in shown[0].vehicles if pose.target is not None]
     points: list[Sequence[float]] = [*paths.tolist(), *goals]
-    for instant in shown[:: max(1, len(shown) // 100)]:
-        for ball in instant.balls:
-            if float(np.linalg.norm(paths - ball.p_enu, axis=1).min()) < _BALL_REACH_M:
-                points.append(ball.p_enu)
+    balls = [ball.p_enu for instant in shown[:: max(1, len(shown) // 100)] for ball in instant.balls]
+    points += [p_enu for p_enu in balls if float(np.linalg.norm(paths - p_enu, axis=1).min()) < _BALL_REACH_M]
     points += [(x, y, 0.0) for x, y, _ in points]  # and the ground below
     return np.array(points)
 

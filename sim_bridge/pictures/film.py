@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -102,7 +103,7 @@ def check_mp4(size: Size) -> None:
     _ffmpeg()
 
 
-def _ffmpeg():  # type: ignore[no-untyped-def]  # the package has no types
+def _ffmpeg() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError:

@@ -105,7 +105,9 @@ def read_log(path: Path) -> Log:
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
             if number == len(lines) and instants and not isinstance(error, msgspec.ValidationError):
                 break  # a run that was killed leaves its last line cut short
-            raise ScenarioError(f"{path}: line {number}: expected a trace of sim-bridge run --trace ({error})") from None
+            raise ScenarioError(
+                f"{path}: line {number}: expected a trace of sim-bridge run --trace ({error})"
+            ) from None
         except ValueError as error:
             raise ScenarioError(f"{path}: line {number}: {error}") from None
         if instants and instant.t_s <= instants[-1].t_s:

@@ -6,6 +6,7 @@ straight down, so that they tell where on the ground something is; they are draw
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -98,7 +99,7 @@ def _path(
 def _densified(points: Array, step_m: float = 0.05) -> Array:
     """More points on the same line, so that it can end where it goes behind something."""
     pieces = []
-    for a, b in zip(points, points[1:], strict=False):
+    for a, b in itertools.pairwise(points):
         count = max(1, int(np.linalg.norm(b - a) / step_m))
         pieces.append(a + np.linspace(0.0, 1.0, count, endpoint=False)[:, None] * (b - a))
     return np.vstack([*pieces, points[-1:]])
