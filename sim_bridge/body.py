@@ -1,8 +1,8 @@
 """One vehicle in PyBullet: a rigid body under its rotors' thrust, torque and drag.
 
 Each step: rotor speeds follow their commands with first-order lag; every rotor pushes with k_f w^2 where it stands
-and turns the body with c k_m w^2; rotor drag F = -k (sum w) v acts in body axes. The body is moved by these forces and
-by contacts alone: nothing here sets its pose or velocity once it is built.
+and turns the body with c k_m w^2; rotor drag F = -k (sum w) v acts in body axes, v relative to the air. The body is
+moved by these forces and by contacts alone: nothing here sets its pose or velocity once it is built.
 """
 
 from __future__ import annotations
@@ -40,14 +40,31 @@ class Start:
 class Body:
     """A vehicle's body in the PyBullet client ``client``, its rotors and its last state."""
 
-    def __init__(self, client: int, vehicle: Crazyflie, start: Start, *, physics_hz: int) -> None:
+    def __init__(
+        self,
+        client: int,
+        vehicle: Crazyflie,
+        start: Start,
+        *,
+        physics_hz: int,
+        motor_lag: bool = True,
+        rotor_drag: bool = True,
+    ) -> None:
         self.vehicle = vehicle
         self.rotor_rpm: Quad = (0.0, 0.0, 0.0, 0.0)
+        self.rotors_flu = vehicle.rotor_positions_flu
+        self.factors: Quad = (1.0, 1.0, 1.0, 1.0)  # of each rotor's thrust
+        self.wind_enu: Triple | None = None  # the air's velocity [m/s]; None: still
+        self.downwash_n = 0.0  # downwards, at the centre of mass
         self._client = client
-        self._rotors_flu = vehicle.rotor_positions_flu
+        self._rated_rpm = vehicle.max_rpm
+        self._top_rpm = self._rated_rpm
+        self._drag = rotor_drag
         # exact solution of the lag over one step with the command held
         self._lag_up = -math.expm1(-1.0 / (physics_hz * vehicle.motor_up_s))
         self._lag_down = -math.expm1(-1.0 / (physics_hz * vehicle.motor_down_s))
+        if not motor_lag:
+            self._lag_up = self._lag_down = 1.0
         self.number = self._build(start)
         self.state = self.read()
 
@@ -81,15 +98,31 @@ class Body:
         self.rotor_rpm = self._follow(rpm_command)
         k_f, k_m, link_frame = self.vehicle.k_f, self.vehicle.k_m, pybullet.LINK_FRAME
         torque_z_n_m = 0.0
-        for rpm, position_flu, sign in zip(self.rotor_rpm, self._rotors_flu, SPIN_TORQUE_SIGN, strict=True):
+        for rpm, position_flu, sign, factor in zip(
+            self.rotor_rpm, self.rotors_flu, SPIN_TORQUE_SIGN, self.factors, strict=True
+        ):
             squared = rpm * rpm
             torque_z_n_m += sign * k_m * squared
-            pybullet.applyExternalForce(body, -1, (0.0, 0.0, k_f * squared), position_flu, link_frame, client)
+            pybullet.applyExternalForce(body, -1, (0.0, 0.0, k_f * squared * factor), position_flu, link_frame, client)
         pybullet.applyExternalTorque(body, -1, (0.0, 0.0, torque_z_n_m), link_frame, client)
-        pybullet.applyExternalForce(body, -1, self._drag_flu(), _ORIGIN, link_frame, client)
+        if self._drag:
+            pybullet.applyExternalForce(body, -1, self._drag_flu(), _ORIGIN, link_frame, client)
+        if self.downwash_n > 0.0:
+            down = (0.0, 0.0, -self.downwash_n)
+            pybullet.applyExternalForce(body, -1, down, self.state.p_enu, pybullet.WORLD_FRAME, client)
+
+    @property
+    def thrusts_n(self) -> list[float]:
+        """Of each rotor, away from ground and wakes [N]."""
+        k_f = self.vehicle.k_f
+        return [k_f * rpm * rpm for rpm in self.rotor_rpm]
+
+    def limit(self, available: float) -> None:
+        """Let the motors give no more than this share of their rated thrust."""
+        self._top_rpm = self._rated_rpm * math.sqrt(available)
 
     def _follow(self, rpm_command: Quad) -> Quad:
-        up, down, top = self._lag_up, self._lag_down, self.vehicle.max_rpm
+        up, down, top = self._lag_up, self._lag_down, self._top_rpm
         speeds = []
         for rpm, command in zip(self.rotor_rpm, rpm_command, strict=True):
             error = min(max(command, 0.0), top) - rpm
@@ -98,9 +131,12 @@ class Body:
         return (w0, w1, w2, w3)
 
     def _drag_flu(self) -> Triple:
-        """-k (sum of rotor speeds, rad/s) v in body axes [N]."""
+        """-k (sum of rotor speeds, rad/s) (v - wind) in body axes [N]."""
         total = sum(self.rotor_rpm) * _RAD_S_PER_RPM
-        vx, vy, vz = to_body(self.state.q_wxyz, self.state.v_enu)
+        v_enu, wind_enu = self.state.v_enu, self.wind_enu
+        if wind_enu is not None:
+            v_enu = (v_enu[0] - wind_enu[0], v_enu[1] - wind_enu[1], v_enu[2] - wind_enu[2])
+        vx, vy, vz = to_body(self.state.q_wxyz, v_enu)
         xy, z = -total * self.vehicle.drag_xy_kg_rad, -total * self.vehicle.drag_z_kg_rad
         return (xy * vx, xy * vy, z * vz)
 

@@ -19,9 +19,10 @@ from sim_bridge.flight import Flight
 from sim_bridge.lockstep_runner import Lockstep
 from sim_bridge.messages import NS_PER_S
 from sim_bridge.placement import Resolved, describe, resolve
-from sim_bridge.runner import RealTime, Trace, Wires
+from sim_bridge.runner import RealTime, Trace
 from sim_bridge.scenario import load_scenario
 from sim_bridge.scenario_schema import scenario_schema
+from sim_bridge.wires import Wires
 
 DONE, FAILED, USAGE = 0, 1, 2
 _NO_ZENOH = "none"
@@ -92,7 +93,9 @@ def _add_scenario(parser: argparse.ArgumentParser, *, positional: bool = False) 
         parser.add_argument("--scenario", default="demo", help="a shipped scenario, or a TOML file (default demo)")
     parser.add_argument("--seed", type=_seed, default=0, help="fixes every draw (default 0)")
     parser.add_argument("--no-obstacles", action="store_true", help="leave the obstacles out")
-    parser.add_argument("--name", default="uav1", help="vehicle name, the Zenoh prefix is uav/NAME (default uav1)")
+    parser.add_argument(
+        "--name", help="name of the one vehicle, Zenoh prefix uav/NAME (default: the scenario's)"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 
@@ -120,6 +123,8 @@ def _seed(text: str) -> int:
 
 def _resolved(arguments: argparse.Namespace) -> Resolved:
     name, scenario = load_scenario(arguments.scenario)
+    if arguments.name is not None and len(scenario.fleet) > 1:
+        raise ScenarioError(f"--name {arguments.name}: expected none, {name} has {len(scenario.fleet)} vehicles")
     return resolve(name, scenario, arguments.seed, obstacles=not arguments.no_obstacles)
 
 
@@ -150,7 +155,7 @@ def _run(arguments: argparse.Namespace) -> int:
             onboard_port=arguments.onboard_port,
             ground_port=arguments.gcs_port,
             endpoint=endpoint,
-            prefix=f"uav/{arguments.name}",
+            prefix=None if arguments.name is None else f"uav/{arguments.name}",
             lockstep=arguments.lockstep,
         )
         stack.callback(wires.close)

@@ -7,8 +7,10 @@ from typing import Any
 
 import msgspec
 
+from sim_bridge.battery import BatteryState
 from sim_bridge.controller import Controller
 from sim_bridge.crazyflie import Quad
+from sim_bridge.estimator import Estimator
 from sim_bridge.judge import Judge
 from sim_bridge.messages import NS_PER_S, Reply
 from sim_bridge.obstacles import Point
@@ -26,7 +28,8 @@ class Craft:
     Args:
         name: of the vehicle; the others' sensors report it under this id.
         system_id: its MAVLink system.
-        autopilot: what flies it.
+        autopilot, controller: what flies it.
+        estimator: what it believes of its state; None: the truth.
         sensors: by source; they see the obstacles, then the other vehicles.
         others: name and radius of the other vehicles, in their order [m].
         obstacle_ids: of the world's obstacles, in their order.
@@ -41,6 +44,8 @@ class Craft:
         name: str,
         system_id: int,
         autopilot: Personality,
+        controller: Controller,
+        estimator: Estimator | None,
         sensors: dict[str, Sensor],
         obstacle_ids: Sequence[str],
         others: Sequence[tuple[str, float]],
@@ -58,7 +63,9 @@ class Craft:
         self._end = end
         self._ids = [*obstacle_ids, *(other for other, _ in others)]
         self._radii_m = [*world.radii_m, *(radius_m for _, radius_m in others)]
-        self._controller = Controller(world.vehicles[index], world.physics_hz)
+        self._controller = controller
+        self._estimator = estimator
+        self._belief = self.truth if estimator is None else estimator.update(self.truth)
         self._dt_s = 1.0 / world.physics_hz
 
     @property
@@ -79,7 +86,15 @@ class Craft:
     @property
     def state(self) -> BodyState:
         """Where its estimator believes it to be: what autopilot, controller and telemetry go by."""
-        return self._world.states[self._index]
+        return self._belief
+
+    @property
+    def battery(self) -> BatteryState:
+        return self._world.batteries[self._index].state
+
+    def set_charge(self, share: float) -> None:
+        """Put the battery at ``share`` of its charge, 0 to 1: a fault."""
+        self._world.batteries[self._index].share = share
 
     @property
     def external(self) -> bool:
@@ -97,13 +112,15 @@ class Craft:
         return self._controller.rpm(state, self.autopilot.target(state))
 
     def follow(self, *, at_tick: bool) -> None:
-        """After a physics step: heading, sensors, judge."""
+        """After a physics step: estimate, heading, sensors, judge."""
+        truth = self.truth
+        self._belief = truth if self._estimator is None else self._estimator.update(truth)
         self.autopilot.turn(self._dt_s)
         self.sense()
         judge = self.judge
         if judge is None:
             return
-        t_ns, p_enu, clearance_m = self.t_ns, self.truth.p_enu, self.clearance_m
+        t_ns, p_enu, clearance_m = self.t_ns, truth.p_enu, self.clearance_m
         grounded = self._world.bodies[self._index].on_ground and self.autopilot.external
         judge.step(t_ns, p_enu, clearance_m, grounded=grounded)
         if clearance_m < _NEAR_M or at_tick:
@@ -114,10 +131,11 @@ class Craft:
         t_ns = self.t_ns
         for sensor in self.sensors.values():
             if t_ns >= sensor.next_ns:
-                sensor.sample(t_ns, self._surroundings())
+                sensor.sample(t_ns, self._surroundings(), self.truth)
 
     def control(self) -> tuple[Reply, ...]:
         """The autopilot's look at the clock, once a control period."""
+        self.autopilot.battery(self.battery)
         return self.autopilot.step(self.state, self.t_ns)
 
     def frames(self, source: str, t_ns: int) -> list[Frame]:

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
+
 from sim_bridge.autopilot import Autopilot
+from sim_bridge.controller import Controller, Gains
 from sim_bridge.craft import Craft
 from sim_bridge.crazyflie import Crazyflie
+from sim_bridge.errors import ScenarioError
+from sim_bridge.estimator import Estimator
 from sim_bridge.messages import NS_PER_S, Reply
+from sim_bridge.personality import Personality
 from sim_bridge.physics import Start, World
 from sim_bridge.placement import Resolved
-from sim_bridge.sensors import Sensor
+from sim_bridge.scenario import Scenario, Vehicle
+from sim_bridge.scenario_world import EstimatorNoise, Imu, Physics
+from sim_bridge.sensors import Sensor, sensor_of
+
+_GUSTS, _ESTIMATOR = 0, 1  # effects that draw
+_INTEGRAL_HZ2 = 2.0  # PX4's MPC_Z_VEL_I_ACC
 
 
 class Flight:
@@ -22,58 +33,54 @@ class Flight:
 
     def __init__(self, resolved: Resolved, model: Crazyflie | None = None) -> None:
         model = Crazyflie() if model is None else model
-        scenario = resolved.scenario
+        scenario, fleet = resolved.scenario, resolved.scenario.fleet
         self.resolved = resolved
         self.world = World(
-            [model],
+            [model] * len(fleet),
             [o.motion for o in resolved.obstacles],
             radii_m=[o.radius_m for o in resolved.obstacles],
             physics_hz=scenario.physics_hz,
-            starts=[Start(scenario.vehicle.start, scenario.vehicle.yaw_rad)],
+            starts=[Start(spec.start, spec.yaw_rad) for spec in fleet],
+            effects=scenario.physics,
+            rngs=[resolved.physics_rng(_GUSTS, index) for index in range(len(fleet))],
         )
-        self.crafts: tuple[Craft, ...] = (self._craft(0),)
+        self.crafts = tuple(self._craft(index, spec) for index, spec in enumerate(fleet))
         self._started_ns: int | None = None
         for craft in self.crafts:
             craft.sense()
 
-    def _craft(self, index: int) -> Craft:
+    def _craft(self, index: int, spec: Vehicle) -> Craft:
         scenario, world = self.resolved.scenario, self.world
-        spec, model = scenario.vehicle, world.vehicles[index]
-        autopilot = Autopilot(
-            start_enu=spec.start,
-            rest_height_m=model.radius_m,
-            yaw_rad=spec.yaw_rad,
-            control_hz=scenario.control_hz,
-            physics_hz=scenario.physics_hz,
-        )
-        autopilot.parameters.write("MIS_TAKEOFF_ALT", spec.takeoff_altitude_m, is_int=False)
+        model, physics = world.vehicles[index], scenario.physics
+        others = [(other.name, world.vehicles[i].radius_m) for i, other in enumerate(scenario.fleet) if i != index]
         ids = [o.id for o in self.resolved.obstacles]
+        estimator = None
+        if physics.estimator != EstimatorNoise() or physics.imu != Imu():
+            rng = self.resolved.physics_rng(_ESTIMATOR, index)
+            estimator = Estimator(physics.estimator, physics.imu, physics_hz=scenario.physics_hz, rng=rng)
+        gains = Gains(integral_hz2=_INTEGRAL_HZ2) if _disturbed(scenario) else Gains()
         return Craft(
             world,
             index,
-            name="uav1",
-            system_id=1,
-            autopilot=autopilot,
-            sensors=self._sensors(ids, world.radii_m),
+            name=spec.name,
+            system_id=spec.system_id,
+            autopilot=_autopilot(scenario, spec, model),
+            controller=Controller(model, scenario.physics_hz, gains, hover_thrust_error=physics.hover_thrust_error),
+            estimator=estimator,
+            sensors=self._sensors(
+                index, [*ids, *(name for name, _ in others)], [*world.radii_m, *(radius for _, radius in others)]
+            ),
             obstacle_ids=ids,
-            others=(),
+            others=others,
             end=scenario.end,
-            target_enu=None if scenario.target is None else scenario.target.position,
+            target_enu=scenario.target_of(spec),
         )
 
-    def _sensors(self, ids: list[str], radii_m: tuple[float, ...]) -> dict[str, Sensor]:
+    def _sensors(self, vehicle: int, ids: list[str], radii_m: list[float]) -> dict[str, Sensor]:
+        scenario = self.resolved.scenario
         return {
-            spec.source: Sensor(
-                ids,
-                radii_m,
-                rate_hz=spec.rate_hz,
-                sigma_m=spec.sigma_m,
-                latency_s=spec.latency_s,
-                dropout=spec.dropout,
-                frame_dropout=spec.frame_dropout,
-                rng=self.resolved.sensor_rng(index),
-            )
-            for index, spec in enumerate(self.resolved.scenario.sensors)
+            spec.source: sensor_of(spec, ids, radii_m, self.resolved.sensor_rng(index, vehicle))
+            for index, spec in scenario.carried(scenario.fleet[vehicle].name)
         }
 
     @property
@@ -150,3 +157,32 @@ class Flight:
 
     def close(self) -> None:
         self.world.close()
+
+
+def _autopilot(scenario: Scenario, spec: Vehicle, model: Crazyflie) -> Personality:
+    """The autopilot of one vehicle, with the parameters of its table."""
+    if spec.personality != "px4":
+        raise ScenarioError(f"{spec.name}: personality: expected px4, got {spec.personality}")
+    autopilot = Autopilot(
+        start_enu=spec.start,
+        rest_height_m=model.radius_m,
+        yaw_rad=spec.yaw_rad,
+        control_hz=scenario.control_hz,
+        physics_hz=scenario.physics_hz,
+    )
+    parameters = autopilot.parameters
+    parameters.write("MIS_TAKEOFF_ALT", spec.takeoff_altitude_m, is_int=False)
+    for name, value in spec.parameters.items():
+        if name not in parameters.names:
+            raise ScenarioError(f"{spec.name}: parameters: expected a parameter of {spec.personality}, got {name}")
+        is_int = parameters.is_int(name)
+        typed = float(value) if not is_int else int(value) if value == int(value) else value
+        if not parameters.write(name, typed, is_int=is_int):
+            raise ScenarioError(f"{spec.name}: parameters.{name}: expected a value in its range, got {value}")
+    return autopilot
+
+
+def _disturbed(scenario: Scenario) -> bool:
+    """Something pushes a hovering vehicle aside: position and velocity loops then need their integral."""
+    plain = msgspec.structs.replace(scenario.physics, motor_lag=True, rotor_drag=True, battery_start=1.0)
+    return plain != Physics() or any(fault.what == "gust" for fault in scenario.faults)

@@ -3,6 +3,7 @@
 Each link sends to 127.0.0.1:PORT from a socket of its own and answers whoever speaks to that socket. A packet that
 is not for the autopilot alone goes on to the other link: broadcasts always, addressed ones where the addressee was
 heard there. Nothing goes back to the link it came from, and nothing that claims to be the autopilot is passed on.
+Faults stand between a link and its socket, one `Channel` a direction; what they delay comes out of `release`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import socket
 from collections.abc import Iterator
 from typing import TypeAlias
 
+from sim_bridge.impairments import Channel, Passage, join, split
 from sim_bridge.mavlink import COMPONENT, Decoder, Encoder, Packet
 from sim_bridge.messages import LinkName, Sender
 
@@ -19,6 +21,7 @@ TIMESYNC = 111
 _DATAGRAM = 65535
 _PER_DRAIN = 256  # so that a flood cannot keep the simulator from flying
 _PEERS = 8
+CORKED_BYTES = 60_000  # what is held back must fit one datagram; the oldest goes first
 
 Address: TypeAlias = tuple[str, int]
 
@@ -31,6 +34,9 @@ class Link:
         self.port = port
         self.encoder = Encoder(system)
         self.heard: set[Sender] = set()
+        self.outbound: Channel[bytes] | None = None  # faults, where there are any
+        self.inbound: Channel[bytes] | None = None
+        self._corked: list[Passage[bytes]] | None = None
         self._home: Address = (host, port)
         self._peers: list[Address] = []
         self._decoder = Decoder()
@@ -43,8 +49,61 @@ class Link:
         """Runs of bytes that were no MAVLink."""
         return self._decoder.damaged
 
-    def send(self, data: bytes) -> None:
-        """To the configured port and to everybody else who spoke to this link; nobody there is no error."""
+    def send(self, data: bytes, *, timed: bool = True) -> None:
+        """To the configured port and to everybody else who spoke to this link; nobody there is no error.
+
+        ``timed`` false: what the wall clock alone calls for, while vehicle time is held. It is never corked.
+        """
+        if self.outbound is None and self._corked is None:
+            self._transmit(data)
+            return
+        messages = split(data)
+        channel = self.outbound
+        passed = [Passage(m) for m in messages] if channel is None else channel.pass_on(messages, timed=timed)
+        if self._corked is not None and timed:
+            self._corked += passed
+        else:
+            self._transmit(join(passed))
+
+    def cork(self) -> None:
+        """Hold back what is sent from now on, for one datagram."""
+        if self._corked is None:
+            self._corked = []
+
+    def uncork(self) -> list[Passage[bytes]]:
+        """Send what was held back as one datagram; returns its messages."""
+        corked, self._corked = self._corked or [], None
+        size = 0
+        for at in range(len(corked) - 1, -1, -1):
+            size += len(corked[at].item)
+            if size > CORKED_BYTES:
+                corked = corked[at + 1 :]
+                break
+        self._transmit(join(corked))
+        return corked
+
+    def release(self) -> Iterator[Packet]:
+        """Send what was delayed until now, and yield what had been delayed on its way in."""
+        if self.outbound is not None and (late := self.outbound.release()):
+            if self._corked is None:
+                self._transmit(join(late))
+            else:
+                self._corked += late
+        if self.inbound is not None:
+            yield from self._decoded(self.inbound.release())
+
+    def impaired(self, packet: Packet, *, timed: bool = True) -> Iterator[Packet]:
+        """What the faults leave of a packet that has arrived."""
+        if self.inbound is None:
+            yield packet
+        else:
+            yield from self._decoded(self.inbound.pass_on([packet.raw], timed=timed))
+
+    def _decoded(self, passages: list[Passage[bytes]]) -> Iterator[Packet]:
+        for passage in passages:
+            yield from self._decoder.packets(passage.item)
+
+    def _transmit(self, data: bytes) -> None:
         if not data:
             return
         for address in (self._home, *self._peers):

@@ -1,8 +1,9 @@
-"""Fly in lockstep with the companion: simulated time moves only when every participant has answered.
+"""Fly in lockstep with the companions: simulated time moves only when every participant has answered.
 
-For each tick of vehicle time T: the operator's steps that are due (time is held until their command is here), the
-sensors' frames and one marker a source, the vehicle's state, then wait for the companion's answer to T, then one
-control period of physics. Timeouts count vehicle time, but for the guards of wall time below.
+For each tick of vehicle time T: the faults that begin or end, the operator's steps that are due (time is held until
+their command is here), then for each vehicle the sensors' frames, one marker a source and its state; then every
+companion's answer is waited for, then one control period of physics. Timeouts count vehicle time, but for the guards
+of wall time below.
 """
 
 from __future__ import annotations
@@ -10,23 +11,22 @@ from __future__ import annotations
 import math
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from sim_bridge.faults import Faults, Process
 from sim_bridge.flight import Flight
-from sim_bridge.links import Link
-from sim_bridge.lockstep import COMPANION, Answer, Desk, LockstepStalled, Offer
-from sim_bridge.mavlink import Packet
-from sim_bridge.messages import NS_PER_S, Ack, Command
-from sim_bridge.runner import Trace, Wires, due_frames, outcome
-from sim_bridge.scenario import OperatorStep
-from sim_bridge.station import Station
+from sim_bridge.lockstep import Desk, LockstepStalled
+from sim_bridge.messages import NS_PER_S
+from sim_bridge.runner import Operator, Trace, outcome, stations_of
+from sim_bridge.seat import REMIND_S, Seat, Tap, named, steps_of
 from sim_bridge.telemetry import ALIVE, HEARTBEAT
+from sim_bridge.wires import Wires
 
-ANSWER_S = 1.0  # wall time without progress of the companion
-PRESENCE_S = 30.0  # wall time until the companion is there
+ANSWER_S = 1.0  # wall time without progress of a companion
+PRESENCE_S = 30.0  # wall time until the companions are there
 OPERATOR_S = 30.0  # wall time until the operator's command is there
 _ONBOARD_ALIVE_S = 1.0  # heartbeats in wall time while time is held
 _GROUND_ALIVE_S = 0.25  # and the ground station's telemetry, so that it finds us healthy soon
@@ -34,34 +34,58 @@ _POLL_S = 0.02
 
 
 class Lockstep:
-    """One flight in lockstep; ``wires`` must have a Zenoh session."""
+    """One flight in lockstep; ``wires`` must have a Zenoh session.
+
+    Args:
+        progress: called after every control period with the flight.
+        processes: daemons that faults may freeze and kill, by vehicle name.
+        operator: plays the scenario's steps; None: someone at the ground links does, and is waited for.
+        tap: told what the companions say.
+    """
 
     def __init__(
-        self, flight: Flight, wires: Wires, *, trace: Trace, progress: Callable[[Flight], None], stay: bool = False
+        self,
+        flight: Flight,
+        wires: Wires,
+        *,
+        trace: Trace,
+        progress: Callable[[Flight], None],
+        stay: bool = False,
+        processes: Mapping[str, Process] | None = None,
+        operator: Operator | None = None,
+        tap: Tap | None = None,
     ) -> None:
-        if wires.bridge is None:
-            raise ValueError("lockstep needs a Zenoh session")
         self.flight = flight
+        self.stations = stations_of(flight, wires, clock_ns=lambda: flight.t_ns, lockstep=True)
+        self.faults = Faults(flight, wires.crafts, self.stations, processes)
         self._wires = wires
-        self._bridge = wires.bridge
         self._trace = trace
         self._progress = progress
-        self._desk = Desk(flight.resolved.scenario.operator)
-        self._station = Station(
-            flight.crafts[0], wires.router, t_ns=lambda: flight.t_ns, clock_ns=lambda: flight.t_ns, lockstep=True
-        )
-        self._answer = Answer(-1, wires.bridge.record_key)
-        self._obstacles_ns = -1  # tick up to which frames and markers have left
-        # what every sensor will hand out at the next tick is measured already: it leaves before the physics
-        period_s = flight.resolved.period_ns / NS_PER_S
-        self._foresees = all(spec.latency_s >= period_s for spec in flight.resolved.scenario.sensors)
-        self._companion_acks: dict[int, bytes] = {}  # by command
+        self._operator = operator
+        self._seats = tuple(self._seat(index, tap) for index in range(len(flight.crafts)))
         self._stopped = False
         self._ends = flight.resolved.scenario.end.stop and not stay
         self._held_s = 0.0
         self._alive_at = [-math.inf, -math.inf]  # onboard, ground
         self._costs_ms: defaultdict[str, list[float]] = defaultdict(list)
-        self._offboard_wall: float | None = None
+        self._external_wall: float | None = None
+
+    def _seat(self, index: int, tap: Tap | None) -> Seat:
+        craft, wires, scenario = self.flight.crafts[index], self._wires.crafts[index], self.flight.resolved.scenario
+        if wires.bridge is None:
+            raise ValueError("lockstep needs a Zenoh session")
+        return Seat(
+            index,
+            craft,
+            wires,
+            wires.bridge,
+            self.stations[index],
+            desk=Desk(steps_of(scenario.operator, wires.vehicle.name)),
+            companion=self.faults.companions[index],
+            careful=self.faults.touches_onboard(index),
+            period_ns=self.flight.resolved.period_ns,
+            tap=tap,
+        )
 
     def stop(self) -> None:
         self._stopped = True
@@ -74,14 +98,16 @@ class Lockstep:
             LockstepStalled: what was missing.
         """
         flight = self.flight
-        self._await_companion()
+        self._await_companions()
         began = time.perf_counter()
         while not self._stopped and not (self._ends and flight.ended is not None):
+            self._begin()
             held_since = time.perf_counter()
-            self._await_operator()
+            for seat in self._seats:
+                self._await_operator(seat)
             self._held_s += time.perf_counter() - held_since
             marks: list[float] = []
-            for phase in (self._send, self._await_answer, self._advance):
+            for phase in (self._send, self._await_answers, self._advance):
                 marks.append(time.perf_counter())
                 if not self._stopped:
                     phase()
@@ -91,72 +117,91 @@ class Lockstep:
 
     # --- phases of a tick
 
-    def _await_operator(self) -> None:
+    def _begin(self) -> None:
+        """What changes at the beginning of a control period, whoever is there."""
+        self.faults.step()
+        if self._operator is not None:
+            self._operator.tick(self.flight.t_ns)
+        for seat in self._seats:
+            seat.release()
+            seat.receive()
+
+    def _await_operator(self, seat: Seat) -> None:
         """Apply the steps that are due at this tick, holding time until each command is here."""
         while not self._stopped:
-            step = self._desk.next_step
-            if step is None or not self._due(step):
+            step = seat.desk.next_step
+            if step is None or not seat.due(step, self.flight.ended is not None):
                 return
-            self._hold(
-                lambda: self._desk.ready() is not None,
-                OPERATOR_S,
-                lambda: f"no operator command for step {_named(self._desk.next_step)}",
-            )
-            offer = self._desk.ready()
+            if self._operator is not None:
+                self._operator.give(seat.index, step, self.flight.t_ns)
+                seat.receive()
+                if seat.desk.ready() is None:
+                    return  # lost or late on the way: time goes on, and it is sent again
+            else:
+                self._hold(
+                    lambda: seat.desk.ready() is not None,
+                    OPERATOR_S,
+                    lambda: f"no operator command for step {named(seat.desk.next_step)} of {seat.craft.name}",
+                )
+            offer = seat.desk.ready()
             if offer is not None:
-                self._desk.done(self._apply(step, offer))
+                seat.desk.done(seat.apply(step, offer, self._await_ack))
+
+    def _await_ack(self, seat: Seat, number: int, missing: str) -> None:
+        self._hold(lambda: number in seat.companion_acks, ANSWER_S, lambda: missing)
 
     def _send(self) -> None:
-        """Frames, markers, then the autopilot's messages with the state last."""
-        flight = self.flight
-        self._answer = Answer(flight.t_ns, self._bridge.record_key)
-        self._send_obstacles(flight.t_ns)
-        self._station.say(flight.control()[0])
-        self._station.announce()
-        self._station.stream(self._wires.router.onboard)
-        # the companion computes now: what it does not wait for is done beside it
-        self._station.stream(self._wires.router.ground)
-        self._trace.write(flight)
+        """Frames, markers, then the autopilots' messages with the state last."""
+        replies = self.flight.control()
+        for seat in self._seats:
+            seat.send(replies[seat.index])
+        # the companions compute now: what they do not wait for is done beside it
+        for seat in self._seats:
+            seat.station.stream(seat.router.ground)
+        self._trace.write(self.flight)
 
-    def _send_obstacles(self, tick_ns: int) -> None:
-        """The frames that are due at ``tick_ns`` and one marker a source, unless they have left already."""
-        if tick_ns <= self._obstacles_ns:
-            return
-        self._obstacles_ns = tick_ns
-        sent = dict.fromkeys((spec.source for spec in self.flight.resolved.scenario.sensors), 0)
-        for source, payload in due_frames(self.flight, tick_ns):
-            self._bridge.publish_frame(source, payload)
-            sent[source] += 1
-        for source, frames in sent.items():
-            self._bridge.publish_marker(source, tick_ns, frames)
-
-    def _await_answer(self) -> None:
-        answer = self._answer
+    def _await_answers(self) -> None:
         deadline, progress = time.monotonic() + ANSWER_S, 0
-        while not answer.complete and not self._stopped:
-            if not self._wires.wait(deadline - time.monotonic()) and time.monotonic() >= deadline:
-                raise LockstepStalled(f"lockstep: after {ANSWER_S:g} s: {answer.missing()}")
+        while not self._stopped:
+            waiting = [seat for seat in self._seats if seat.waits]
+            if not waiting:
+                return
+            left_s = deadline - time.monotonic()
+            reminding = [seat for seat in waiting if seat.reminds]
+            if not self._wires.wait(min(left_s, REMIND_S) if reminding else left_s):
+                if time.monotonic() >= deadline:
+                    missing = "; ".join(seat.answer.missing() for seat in waiting if seat.answer is not None)
+                    raise LockstepStalled(f"lockstep: after {ANSWER_S:g} s: {missing}")
+                for seat in reminding:
+                    seat.remind()
             self._receive()
-            if answer.progress > progress:
-                deadline, progress = time.monotonic() + ANSWER_S, answer.progress
+            come = sum(seat.answer.progress for seat in self._seats if seat.answer is not None)
+            if come > progress:
+                deadline, progress = time.monotonic() + ANSWER_S, come
 
     def _advance(self) -> None:
         flight = self.flight
-        if self._foresees:
-            self._send_obstacles(flight.t_ns + flight.resolved.period_ns)
-        if self._offboard_wall is None and flight.crafts[0].autopilot.external:
-            self._offboard_wall = time.perf_counter()
+        for seat in self._seats:
+            seat.send_ahead()
+        if self._external_wall is None and any(craft.autopilot.external for craft in flight.crafts):
+            self._external_wall = time.perf_counter()
         for _ in range(flight.resolved.control_steps):
             flight.advance()
         self._progress(flight)
 
     # --- waiting
 
-    def _await_companion(self) -> None:
-        bridge = self._bridge
-        self._hold(lambda: bridge.companion_alive, PRESENCE_S, lambda: f"no liveliness token {bridge.alive_key}")
+    def _await_companions(self) -> None:
+        bridges = [seat.bridge for seat in self._seats]
         self._hold(
-            lambda: not bridge.unmatched(), PRESENCE_S, lambda: f"no subscriber to {', '.join(bridge.unmatched())}"
+            lambda: all(bridge.companion_alive for bridge in bridges),
+            PRESENCE_S,
+            lambda: "no liveliness token " + ", ".join(b.alive_key for b in bridges if not b.companion_alive),
+        )
+        self._hold(
+            lambda: not any(bridge.unmatched() for bridge in bridges),
+            PRESENCE_S,
+            lambda: "no subscriber to " + ", ".join(key for bridge in bridges for key in bridge.unmatched()),
         )
 
     def _hold(self, arrived: Callable[[], bool], limit_s: float, missing: Callable[[], str]) -> None:
@@ -174,64 +219,16 @@ class Lockstep:
         onboard_at, ground_at = self._alive_at
         if now - onboard_at >= _ONBOARD_ALIVE_S:
             self._alive_at[0] = now
-            self._station.stay_alive(self._wires.router.onboard, (HEARTBEAT,))
+            for seat in self._seats:
+                seat.stay_alive(seat.router.onboard, (HEARTBEAT,))
         if now - ground_at >= _GROUND_ALIVE_S:
             self._alive_at[1] = now
-            self._station.stay_alive(self._wires.router.ground, ALIVE)
+            for seat in self._seats:
+                seat.stay_alive(seat.router.ground, ALIVE)
 
     def _receive(self) -> None:
-        for record in self._bridge.records():
-            self._answer.record(record.stamp_ns, sent=record.sent, messages=record.messages)
-        router = self._wires.router
-        for link, packet in router.receive():
-            if link is router.ground and self._keep(packet):
-                continue
-            if link is router.onboard:
-                self._answer.packet(packet.message_id, packet.sender.component, packet.time_boot_ms)
-                if packet.ack_of is not None and packet.sender.component == COMPANION:
-                    self._companion_acks[packet.ack_of] = packet.raw
-            router.forward(link, packet)
-            self._station.handle(link, packet)
-
-    def _keep(self, packet: Packet) -> bool:
-        """Whether a packet of the ground station is an operator's step, to be applied on its tick."""
-        if not isinstance(packet.content, Command):
-            return False
-        answer = self._desk.take(Offer(packet.content, packet))
-        if answer:
-            self._wires.router.ground.send(answer)
-        return answer is not None
-
-    # --- the operator's steps
-
-    def _due(self, step: OperatorStep) -> bool:
-        flight = self.flight
-        if step.at_tick is not None:
-            return flight.t_ns >= step.at_tick * flight.resolved.period_ns
-        if step.after == "airborne_hover":
-            return flight.crafts[0].autopilot.hovering(flight.t_ns)
-        if step.after == "on_ground":
-            return not flight.crafts[0].autopilot.airborne
-        return flight.ended is not None
-
-    def _apply(self, step: OperatorStep, offer: Offer) -> bytes:
-        """Carry out a step now; returns the acknowledgement that repetitions of its command get."""
-        ground = self._wires.router.ground
-        if offer.command.target_component == COMPANION:
-            return self._pass_on(ground, step, offer)
-        replies = self._station.handle(ground, offer.packet)
-        ack = next((reply for reply in replies if isinstance(reply, Ack)), None)
-        return b"" if ack is None else ground.encoder.ack(ack)
-
-    def _pass_on(self, ground: Link, step: OperatorStep, offer: Offer) -> bytes:
-        """Give the command to the companion and wait for its acknowledgement, which `_receive` forwards."""
-        number = offer.command.command
-        self._companion_acks.pop(number, None)
-        missing = f"no COMMAND_ACK of component {COMPANION} for step {_named(step)}"
-        if not self._wires.router.forward(ground, offer.packet):
-            raise LockstepStalled(f"lockstep: {missing}: the component was never heard on the onboard link")
-        self._hold(lambda: number in self._companion_acks, ANSWER_S, lambda: missing)
-        return self._companion_acks.get(number, b"")
+        for seat in self._seats:
+            seat.receive()
 
     # --- figures
 
@@ -241,20 +238,14 @@ class Lockstep:
 
     def _timing(self, began: float) -> dict[str, Any]:
         now = time.perf_counter()
-        flight, judge = self.flight, self.flight.crafts[0].judge
+        flight = self.flight
         wall_s = now - began
+        starts_ns = [craft.judge.start_ns for craft in flight.crafts if craft.judge is not None]
         factor = None
-        if judge is not None and self._offboard_wall is not None:
-            factor = (flight.t_ns - judge.start_ns) / NS_PER_S / (now - self._offboard_wall)
+        if starts_ns and self._external_wall is not None:
+            factor = (flight.t_ns - min(starts_ns)) / NS_PER_S / (now - self._external_wall)
         costs = {
             name: {"p50": float(np.percentile(values, 50)), "p99": float(np.percentile(values, 99)), "max": max(values)}
             for name, values in self._costs_ms.items()
         }
         return {"wall_s": wall_s, "held_s": self._held_s, "real_time_factor": factor, "tick_ms": costs}
-
-
-def _named(step: OperatorStep | None) -> str:
-    if step is None:
-        return "none"
-    when = f"at tick {step.at_tick}" if step.at_tick is not None else f"after {step.after}"
-    return f"{step.do} ({when})"

@@ -1,6 +1,7 @@
 """The world: vehicles, moving spheres and the ground in PyBullet, advanced one physics step at a time.
 
-Each step the vehicles' rotors push (`body`), PyBullet integrates, and the spheres move to where their motions say.
+Each step the air acts (`air`), the vehicles' rotors push (`body`), PyBullet integrates, the spheres move to where their
+motions say, and the batteries discharge (`battery`).
 
 Contacts follow clearance: when PyBullet looks for contacts, spheres and vehicles stand where clearance was last taken,
 and it makes a contact of two spheres only from zero distance on. So no push can keep a collision from being seen.
@@ -12,16 +13,22 @@ import math
 from collections.abc import Sequence
 from types import TracebackType
 
+import numpy as np
 import pybullet
 
+from sim_bridge.air import Air
+from sim_bridge.battery import Battery
 from sim_bridge.body import Body, BodyState, Start, to_body
-from sim_bridge.crazyflie import Crazyflie, Quad
+from sim_bridge.crazyflie import Crazyflie, Quad, Triple
 from sim_bridge.errors import ScenarioError
 from sim_bridge.obstacles import Motion, Point
+from sim_bridge.pursuit import Reacting
+from sim_bridge.scenario_world import Physics
 
 __all__ = ["BodyState", "Start", "World", "control_steps", "to_body"]
 
 _LEVEL_XYZW = (0.0, 0.0, 0.0, 1.0)
+_BATTERY_HZ = 20  # at which batteries discharge where they do not act on the flight
 
 
 def control_steps(physics_hz: int, control_hz: int) -> int:
@@ -40,6 +47,9 @@ def control_steps(physics_hz: int, control_hz: int) -> int:
     return physics_hz // control_hz
 
 
+_PLAIN = Physics()
+
+
 class World:
     """Vehicles among moving spheres above the ground z = 0; a PyBullet client of its own in DIRECT mode.
 
@@ -48,6 +58,8 @@ class World:
         motions, radii_m: one of each per obstacle.
         physics_hz: steps a second.
         starts: one per vehicle; no two vehicles may touch there.
+        effects: which act; by default motor lag and rotor drag.
+        rngs: one generator per vehicle for its gusts; none needed without.
     Raises:
         ScenarioError: numbers that do not match, a start below the ground or inside another, or a bad rate.
     """
@@ -60,6 +72,8 @@ class World:
         radii_m: Sequence[float],
         physics_hz: int,
         starts: Sequence[Start],
+        effects: Physics = _PLAIN,
+        rngs: Sequence[np.random.Generator] = (),
     ) -> None:
         if len(radii_m) != len(motions):
             raise ScenarioError(f"radii_m: expected {len(motions)} values, one for each motion, got {len(radii_m)}")
@@ -68,19 +82,26 @@ class World:
         _check_starts(vehicles, starts)
         self.vehicles = tuple(vehicles)
         self.motions = tuple(motions)
+        self._reacting = tuple(motion for motion in self.motions if isinstance(motion, Reacting))
+        for motion in self._reacting:
+            motion.reset()
         self.radii_m = tuple(float(radius_m) for radius_m in radii_m)
         self.physics_hz = physics_hz
         self.step_count = 0
+        self.batteries = tuple(Battery(effects.battery_start) for _ in vehicles)
+        self._sag = effects.battery_sag
+        self._battery_steps = 1 if self._sag else max(1, physics_hz // _BATTERY_HZ)
         self._motions_from_step: int | None = None
         self._client = pybullet.connect(pybullet.DIRECT)
-        self._build(starts)
+        self._build(starts, effects)
+        self._air = Air(effects, self.bodies, physics_hz=physics_hz, rngs=rngs)
         self.states: tuple[BodyState, ...] = tuple(body.state for body in self.bodies)
         self.obstacles_enu = self.obstacle_positions(0.0)  # true centres at this step [m]
         self.clearances_m = self._clearances()  # surface to surface, of each vehicle from all else but the ground [m]
         self.min_clearances_m = list(self.clearances_m)
         self.touched_ground = [body.on_ground for body in self.bodies]
 
-    def _build(self, starts: Sequence[Start]) -> None:
+    def _build(self, starts: Sequence[Start], effects: Physics) -> None:
         client = self._client
         pybullet.setTimeStep(1.0 / self.physics_hz, physicsClientId=client)
         pybullet.setGravity(0.0, 0.0, -self.vehicles[0].g_m_s2, physicsClientId=client)
@@ -92,7 +113,14 @@ class World:
             ground, -1, lateralFriction=1.0, rollingFriction=1.0, spinningFriction=1.0, physicsClientId=client
         )
         self.bodies = tuple(
-            Body(client, vehicle, start, physics_hz=self.physics_hz)
+            Body(
+                client,
+                vehicle,
+                start,
+                physics_hz=self.physics_hz,
+                motor_lag=effects.motor_lag,
+                rotor_drag=effects.rotor_drag,
+            )
             for vehicle, start in zip(self.vehicles, starts, strict=True)
         )
         self._spheres = [
@@ -117,12 +145,18 @@ class World:
 
     def step(self, rpm_commands: Sequence[Quad]) -> None:
         """Advance one physics step; one set of rotor speed commands per vehicle (clipped to the motors') [RPM]."""
+        if self._air.stirred:
+            self._air.stir(self.t_s)
         for body, command in zip(self.bodies, rpm_commands, strict=True):
             body.push(command)
         pybullet.stepSimulation(self._client)
         self.step_count += 1
         if self._motions_from_step is not None:
+            for motion in self._reacting:
+                motion.advance(1.0 / self.physics_hz, self.states)  # as they were when the step began
             self._move_obstacles()
+        if self.step_count % self._battery_steps == 0:
+            self._discharge()
         self.states = tuple([body.read() for body in self.bodies])
         self.clearances_m = self._clearances()
         for index, clearance_m in enumerate(self.clearances_m):
@@ -130,6 +164,17 @@ class World:
                 self.min_clearances_m[index] = clearance_m
             if not self.touched_ground[index]:
                 self.touched_ground[index] = self.bodies[index].on_ground
+
+    def _discharge(self) -> None:
+        dt_s = self._battery_steps / self.physics_hz
+        for body, battery in zip(self.bodies, self.batteries, strict=True):
+            battery.draw(body.thrusts_n, dt_s)
+            if self._sag:
+                body.limit(battery.available)
+
+    def gust(self, v_enu: Triple, for_s: float) -> None:
+        """Add a wind of ``v_enu`` [m/s] everywhere for ``for_s``, from the next step on."""
+        self._air.gust(v_enu, self.t_s + for_s)
 
     def start_motions(self) -> None:
         """Start the motions' clock at this step; before it obstacles wait where they are at t = 0."""

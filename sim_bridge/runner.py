@@ -6,71 +6,30 @@ which wake the loop through a socket pair. Vehicle time is the count of physics 
 
 from __future__ import annotations
 
-import contextlib
-import select
-import socket
 import time
-from collections.abc import Callable, Iterator
-from typing import IO, Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import IO, Any, Protocol
 
 import msgspec
 
+from sim_bridge.faults import Faults, Process
 from sim_bridge.flight import Flight
-from sim_bridge.links import Router
 from sim_bridge.messages import NS_PER_S
-from sim_bridge.placement import Resolved
+from sim_bridge.scenario import OperatorStep
 from sim_bridge.station import Station
-from sim_bridge.zenoh_io import Bridge, encode_frame
+from sim_bridge.wires import CraftWires, Wires
 
 _LATE_NS = NS_PER_S // 4  # of wall time: further behind the clock than this, time is given up, not caught up
 
 
-class Wires:
-    """Both MAVLink links, the Zenoh session if there is one, and the wake-up; opened together, closed together."""
+class Operator(Protocol):
+    """An operator in this process, at the ground links: it is never waited for, it acts when it is its turn."""
 
-    def __init__(
-        self,
-        resolved: Resolved,
-        *,
-        onboard_port: int,
-        ground_port: int,
-        endpoint: str | None,
-        prefix: str,
-        lockstep: bool,
-    ) -> None:
-        self._wake_in, self._wake_out = socket.socketpair()
-        self._wake_in.setblocking(False)
-        self._wake_out.setblocking(False)
-        self.bridge: Bridge | None = None
-        self.router = Router(onboard_port, ground_port)
-        if endpoint is not None:
-            sources = [sensor.source for sensor in resolved.scenario.sensors]
-            try:
-                self.bridge = Bridge(endpoint, prefix, sources, reliable=lockstep, wake=self._wake_out)
-            except BaseException:
-                self.close()
-                raise
-        self._sockets = [self._wake_in, *(link.socket for link in self.router.links)]
+    def tick(self, t_ns: int) -> None:
+        """A control period begins: read what came, keep in touch, in real time also act."""
 
-    def wait(self, timeout_s: float) -> bool:
-        """Sleep until something arrives or the time is up; whether something did."""
-        readable, _, _ = select.select(self._sockets, [], [], max(0.0, timeout_s))
-        if self._wake_in in readable:
-            with contextlib.suppress(BlockingIOError):
-                self._wake_in.recv(4096)
-        return bool(readable)
-
-    def poke(self) -> None:
-        """Wake the loop; may be called from a signal handler or another thread."""
-        with contextlib.suppress(OSError):
-            self._wake_out.send(b"\0")
-
-    def close(self) -> None:
-        if self.bridge is not None:
-            self.bridge.close()
-        self.router.close()
-        self._wake_in.close()
-        self._wake_out.close()
+    def give(self, vehicle: int, step: OperatorStep, t_ns: int) -> None:
+        """Lockstep: send the command of a step that is due, now or again."""
 
 
 class Trace:
@@ -92,6 +51,8 @@ class RealTime:
         progress: called at every control period with the flight.
         stay: fly on after the scenario's end.
         speed: vehicle time over wall time, as PX4's PX4_SIM_SPEED_FACTOR; every clock of the vehicle runs as fast.
+        processes: daemons that faults may freeze and kill, by vehicle name.
+        operator: plays the scenario's steps; None: someone at the ground links does, at will.
     """
 
     def __init__(
@@ -103,8 +64,13 @@ class RealTime:
         progress: Callable[[Flight], None],
         stay: bool = False,
         speed: float = 1.0,
+        processes: Mapping[str, Process] | None = None,
+        operator: Operator | None = None,
     ) -> None:
         self.flight = flight
+        self.stations = stations_of(flight, wires, clock_ns=self._clock_ns, lockstep=False)
+        self.faults = Faults(flight, wires.crafts, self.stations, processes)
+        self._operator = operator
         self._speed = speed
         self._wires = wires
         self._trace = trace
@@ -113,9 +79,6 @@ class RealTime:
         self._late_ns = 0
         self._stopped = False
         self._ends = flight.resolved.scenario.end.stop and not stay
-        self._station = Station(
-            flight.crafts[0], wires.router, t_ns=lambda: flight.t_ns, clock_ns=self._clock_ns, lockstep=False
-        )
 
     def stop(self) -> None:
         self._stopped = True
@@ -149,41 +112,56 @@ class RealTime:
         return round((time.monotonic_ns() - self._epoch_ns) * self._speed)
 
     def _receive(self) -> None:
-        for link, packet in self._wires.router.receive():
-            self._wires.router.forward(link, packet)
-            self._station.handle(link, packet)
+        for own, station in self._vehicles():
+            for link, packet in own.router.receive():
+                for each in link.impaired(packet):
+                    own.router.forward(link, each)
+                    station.handle(link, each)
 
     def _step(self) -> None:
         flight = self.flight
         flight.advance()
         if flight.at_tick:
             self._tick()
-        else:
-            self._publish()
-            self._station.stream(*self._wires.router.links)
+            return
+        self._stream()
 
     def _tick(self) -> None:
         flight = self.flight
-        self._station.say(flight.control()[0])
-        self._station.announce()
-        self._publish()
-        self._station.stream(*self._wires.router.links)
+        self.faults.step()
+        if self._operator is not None:
+            self._operator.tick(flight.t_ns)
+        replies = flight.control()
+        for station, said in zip(self.stations, replies, strict=True):
+            station.say(said)
+            station.announce()
+        self._stream()
         self._trace.write(flight)
         self._progress(flight)
 
-    def _publish(self) -> None:
-        bridge = self._wires.bridge
-        if bridge is None:
-            return
-        for source, payload in due_frames(self.flight, self.flight.t_ns):
-            bridge.publish_frame(source, payload)
+    def _stream(self) -> None:
+        """Frames and messages that are due, and what faults had delayed until now."""
+        for craft, (own, station) in zip(self.flight.crafts, self._vehicles(), strict=True):
+            for link in own.router.links:
+                for packet in link.release():
+                    own.router.forward(link, packet)
+                    station.handle(link, packet)
+            if own.bridge is not None:
+                for feed in own.feeds:
+                    for payload in feed.due(craft, craft.t_ns, station.clock_offset_ns):
+                        own.bridge.publish_frame(feed.source, payload)
+            station.stream(*own.router.links)
+
+    def _vehicles(self) -> Iterator[tuple[CraftWires, Station]]:
+        return zip(self._wires.crafts, self.stations, strict=True)
 
 
-def due_frames(flight: Flight, t_ns: int) -> Iterator[tuple[str, bytes]]:
-    """Encoded frames that have arrived by ``t_ns``, source by source."""
-    for spec in flight.resolved.scenario.sensors:
-        for frame in flight.crafts[0].frames(spec.source, t_ns):
-            yield spec.source, encode_frame(frame, spec.sigma_m)
+def stations_of(flight: Flight, wires: Wires, *, clock_ns: Callable[[], int], lockstep: bool) -> tuple[Station, ...]:
+    """The autopilot of each vehicle on its links."""
+    return tuple(
+        Station(craft, own.router, t_ns=lambda: flight.t_ns, clock_ns=clock_ns, lockstep=lockstep)
+        for craft, own in zip(flight.crafts, wires.crafts, strict=True)
+    )
 
 
 def outcome(flight: Flight) -> dict[str, Any]:

@@ -7,6 +7,7 @@ the start. ``start_s`` and ``end_s`` are when the obstacle is there at all; the 
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, TypeAlias
 
 from msgspec import Meta
@@ -142,6 +143,8 @@ def placing_error(obstacle: Obstacle) -> str | None:
 
 
 def _path_error(obstacle: Obstacle) -> str | None:
+    if isinstance(obstacle, PursuitObstacle) and math.hypot(*obstacle.velocity) > obstacle.speed_m_s:
+        return f"velocity: expected at most speed_m_s {obstacle.speed_m_s}"
     if isinstance(obstacle, WaypointsObstacle):
         legs = [*zip(obstacle.points, obstacle.points[1:], strict=False)]
         legs += [(obstacle.points[-1], obstacle.points[0])] if obstacle.loop else []

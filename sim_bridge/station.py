@@ -80,6 +80,8 @@ class Station:
             )
             for link in router.links
         }
+        self.clock_offset_ns = 0  # by which the vehicle's clock has jumped (faults)
+        self.on_text: Callable[[Text], None] = lambda text: None
         self._announced = self._status()
 
     def handle(self, link: Link, packet: Packet) -> tuple[Reply, ...]:
@@ -99,7 +101,7 @@ class Station:
         elif isinstance(content, Command):
             replies = self._command(link, content)
         elif isinstance(content, Timesync):
-            link.send(link.encoder.timesync(content, self._clock_ns()))
+            link.send(link.encoder.timesync(content, max(0, self._clock_ns() + self.clock_offset_ns)))
         elif isinstance(content, ParamRead):
             self._read_parameters(link, content)
         else:
@@ -112,6 +114,7 @@ class Station:
         """Acknowledgements on ``link``, texts on both."""
         for reply in replies:
             if isinstance(reply, Text):
+                self.on_text(reply)
                 for each in self._router.links:
                     each.send(each.encoder.text(reply))
             elif link is not None:
@@ -141,7 +144,7 @@ class Station:
         """Messages off their schedule, while time is held."""
         now = self._moment()
         for message_id in message_ids:
-            self._send_one(link, message_id, now)
+            self._send_one(link, message_id, now, timed=False)
 
     def send(self, message_id: int) -> None:
         """One message now, on both links."""
@@ -149,11 +152,13 @@ class Station:
         for link in self._router.links:
             self._send_one(link, message_id, now)
 
-    def _send_one(self, link: Link, message_id: int, now: Moment) -> None:
-        link.send(build(message_id, now, link.encoder))
+    def _send_one(self, link: Link, message_id: int, now: Moment, *, timed: bool = True) -> None:
+        link.send(build(message_id, now, link.encoder), timed=timed)
 
     def _moment(self) -> Moment:
-        return Moment(self._t_ns(), self._vehicle.state, self._autopilot, self._router.id.system)
+        return Moment(
+            max(0, self._t_ns() + self.clock_offset_ns), self._vehicle.state, self._autopilot, self._router.id.system
+        )
 
     def _status(self) -> tuple[int, bool, int]:
         autopilot = self._autopilot

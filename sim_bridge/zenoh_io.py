@@ -19,7 +19,7 @@ from sim_bridge.sensors import Frame
 
 
 class ObstacleOut(msgspec.Struct, frozen=True):
-    id: str
+    id: str | None  # None: anonymous
     position: tuple[float, float, float]
     radius: float
     position_std: float
@@ -76,34 +76,54 @@ def encode_frame(frame: Frame, sigma_m: float) -> bytes:
     return _ENCODER.encode(FrameOut(stamp_ns, [ObstacleOut(name, p, radius, std_m) for name, p, radius in seen]))
 
 
-class Bridge:
-    """The simulator's Zenoh session.
+class Session:
+    """The simulator's Zenoh session, for all vehicles.
 
     Args:
         endpoint: where to listen, e.g. ``tcp/127.0.0.1:7447``.
-        wake: written to (one byte) whenever a record or a change of presence has come in.
-        reliable: lockstep's quality of service.
+        wake: written to (one byte) whenever something has come in.
     Raises:
         ScenarioError: the endpoint cannot be listened on.
     """
 
-    def __init__(
-        self, endpoint: str, prefix: str, sources: Sequence[str], *, reliable: bool, wake: socket.socket
-    ) -> None:
+    def __init__(self, endpoint: str, wake: socket.socket) -> None:
+        self._wake = wake
+        try:
+            self.zenoh = zenoh.open(session_config([endpoint]))
+        except zenoh.ZError as error:
+            raise ScenarioError(f"--zenoh-listen {endpoint}: cannot listen there ({_first_words(error)})") from None
+
+    def poke(self) -> None:
+        """Wake the main loop, from any thread."""
+        try:
+            self._wake.send(b"\0")
+        except OSError:
+            return  # full (the loop is awake anyway) or closed (it is going home)
+
+    def close(self) -> None:
+        self.zenoh.close()  # type: ignore[no-untyped-call]
+
+
+class Bridge:
+    """One vehicle's keys.
+
+    Args:
+        prefix: of the keys, e.g. ``uav/uav1``.
+        reliable: lockstep's quality of service; only then are records and presence listened to, but see `listen`.
+    """
+
+    def __init__(self, session: Session, prefix: str, sources: Sequence[str], *, reliable: bool) -> None:
         self.record_key = f"{prefix}/companion/setpoint"
         self.alive_key = f"{prefix}/companion/alive"
         self.companion_alive = False
         self.malformed = 0
         self._records: deque[bytes] = deque()
-        self._wake = wake
-        try:
-            self._session = zenoh.open(session_config([endpoint]))
-        except zenoh.ZError as error:
-            raise ScenarioError(f"--zenoh-listen {endpoint}: cannot listen there ({_first_words(error)})") from None
+        self._session = session
+        self._listens = False
         congestion = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
         self._frames, self._markers = (
             {
-                source: self._session.declare_publisher(
+                source: session.zenoh.declare_publisher(
                     f"{prefix}/{kind}/{source}",
                     encoding="application/json",
                     congestion_control=congestion,
@@ -114,8 +134,14 @@ class Bridge:
             for kind in ("obstacles", "sync")
         )
         if reliable:  # in real time nobody waits for the companion
-            self._session.declare_subscriber(self.record_key, self._on_record)
-            self._session.liveliness().declare_subscriber(self.alive_key, self._on_presence, history=True)
+            self.listen()
+
+    def listen(self) -> None:
+        """Listen to the companion's records and presence."""
+        if not self._listens:
+            self._listens = True
+            self._session.zenoh.declare_subscriber(self.record_key, self._on_record)
+            self._session.zenoh.liveliness().declare_subscriber(self.alive_key, self._on_presence, history=True)
 
     def publish_frame(self, source: str, payload: bytes) -> None:
         self._frames[source].put(payload)
@@ -139,22 +165,13 @@ class Bridge:
                 self.malformed += 1
         return arrived
 
-    def close(self) -> None:
-        self._session.close()  # type: ignore[no-untyped-call]
-
     def _on_record(self, sample: zenoh.Sample) -> None:
         self._records.append(bytes(sample.payload))
-        self._poke()
+        self._session.poke()
 
     def _on_presence(self, sample: zenoh.Sample) -> None:
         self.companion_alive = sample.kind == zenoh.SampleKind.PUT
-        self._poke()
-
-    def _poke(self) -> None:
-        try:
-            self._wake.send(b"\0")
-        except OSError:
-            return  # full (the loop is awake anyway) or closed (it is going home)
+        self._session.poke()
 
 
 def _first_words(error: Exception) -> str:
