@@ -22,8 +22,10 @@ from sim_bridge.flight import Flight
 from sim_bridge.inprocess import sectioned
 from sim_bridge.lockstep_runner import Lockstep
 from sim_bridge.placement import Resolved
-from sim_bridge.runner import Trace, Wires
+from sim_bridge.runner import Trace
+from sim_bridge.seat import Tap
 from sim_bridge.sections import Case, Sections, case
+from sim_bridge.wires import Wires
 from sim_bridge.zenoh_io import Record
 
 STOP_S = 10.0  # the daemon is given this long to end
@@ -64,14 +66,17 @@ Noting = Callable[[Lockstep, Wires], list[int]]
 def _fly(flight: Flight, ports: Ports, prepare: Noting) -> tuple[list[int], float, dict[str, float]]:
     """The ticks [ns] that ``prepare`` notes, the real-time factor, the daemon's own times [ms, medians]."""
     onboard, ground, endpoint = ports
-    prefix = flight.crafts[0].prefix
-    wires = Wires(
-        flight.resolved, onboard_port=onboard, ground_port=ground, endpoint=endpoint, prefix=prefix, lockstep=True
-    )
+    wires = Wires(flight.resolved, onboard_port=onboard, ground_port=ground, endpoint=endpoint, lockstep=True)
+    daemon_ms: defaultdict[str, list[float]] = defaultdict(list)
+
+    def note(index: int, record: Record) -> None:
+        for key, value in record.timings_ms.items():
+            daemon_ms[key].append(value)
+
     try:
-        _engage(wires.router.ground.socket.getsockname())
-        runner = Lockstep(flight, wires, trace=Trace(None), progress=lambda flight: None)
-        daemon_ms = _noting_timings(wires)
+        _engage(wires.crafts[0].router.ground.socket.getsockname())
+        tap = Tap(record=note, packet=lambda index, packet: None)
+        runner = Lockstep(flight, wires, trace=Trace(None), progress=lambda flight: None, tap=tap)
         noted = prepare(runner, wires)
         factor = runner.run()["real_time_factor"]
     finally:
@@ -98,14 +103,14 @@ def _noting_ticks(runner: Lockstep, wires: Wires) -> list[int]:
 
 def _counting(sections: Sections, runner: Lockstep, wires: Wires) -> list[int]:
     """As `_noting_ticks`; from the first of those ticks on, what the parts of a tick cost."""
-    assert wires.bridge is not None
     sections.wrap(wires, "waiting for the daemon", "wait")
-    sections.wrap(wires.bridge, "Zenoh", "publish_frame", "publish_marker", "records")
-    sections.wrap(runner._station, "telemetry", "stream", "say", "announce")
     sections.wrap(runner, "receive", "_receive")
-    for link in wires.router.links:
-        sections.wrap(link.encoder, "encode", "pack")
-        sections.wrap(link, "sockets", "send")
+    for craft, station in zip(wires.crafts, runner.stations, strict=True):
+        sections.wrap(craft.bridge, "Zenoh", "publish_frame", "publish_marker", "records")
+        sections.wrap(station, "telemetry", "stream", "say", "announce")
+        for link in craft.router.links:
+            sections.wrap(link.encoder, "encode", "pack")
+            sections.wrap(link, "sockets", "send")
     ticks_ns = _noting_ticks(runner, wires)
     account = runner._account
 
@@ -116,23 +121,6 @@ def _counting(sections: Sections, runner: Lockstep, wires: Wires) -> list[int]:
 
     runner._account = starting  # type: ignore[method-assign]
     return ticks_ns
-
-
-def _noting_timings(wires: Wires) -> dict[str, list[float]]:
-    """What the daemon's records say of its own time."""
-    assert wires.bridge is not None
-    noted: defaultdict[str, list[float]] = defaultdict(list)
-    records = wires.bridge.records
-
-    def noting() -> list[Record]:
-        arrived = records()
-        for record in arrived:
-            for key, value in record.timings_ms.items():
-                noted[key].append(value)
-        return arrived
-
-    wires.bridge.records = noting  # type: ignore[method-assign]
-    return noted
 
 
 def _engage(address: tuple[str, int]) -> None:

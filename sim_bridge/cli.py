@@ -93,9 +93,7 @@ def _add_scenario(parser: argparse.ArgumentParser, *, positional: bool = False) 
         parser.add_argument("--scenario", default="demo", help="a shipped scenario, or a TOML file (default demo)")
     parser.add_argument("--seed", type=_seed, default=0, help="fixes every draw (default 0)")
     parser.add_argument("--no-obstacles", action="store_true", help="leave the obstacles out")
-    parser.add_argument(
-        "--name", help="name of the one vehicle, Zenoh prefix uav/NAME (default: the scenario's)"
-    )
+    parser.add_argument("--name", help="name of the one vehicle, Zenoh prefix uav/NAME (default: the scenario's)")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
 

@@ -11,6 +11,7 @@ import msgspec
 
 from sim_bridge.crazyflie import Quad, Triple
 from sim_bridge.errors import ScenarioError
+from sim_bridge.obstacles import AWAY_ENU
 
 
 class Pose(msgspec.Struct, frozen=True, kw_only=True):
@@ -29,7 +30,7 @@ class _Line(Pose, frozen=True, kw_only=True):
     """A line of the trace: the first vehicle flat, all of them under ``vehicles`` where there are several."""
 
     t_ns: int
-    obstacles: list[Triple | None]
+    obstacles: list[Triple]  # `AWAY_ENU`: not there now
     obstacle_ids: list[str]
     obstacle_radii_m: list[float]
     vehicles: list[Pose] = []
@@ -126,7 +127,7 @@ def _instant(line: _Line) -> Instant:
     balls = tuple(
         Ball(name, p_enu, radius_m)
         for name, p_enu, radius_m in zip(line.obstacle_ids, line.obstacles, line.obstacle_radii_m, strict=True)
-        if p_enu is not None  # one that is not there now
+        if p_enu != AWAY_ENU  # not there now
     )
     return Instant(line.t_ns / 1e9, tuple(line.vehicles) or (line,), balls)
 
