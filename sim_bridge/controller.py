@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from sim_bridge.crazyflie import SPIN_TORQUE_SIGN, Crazyflie, Quad, Triple
+from sim_bridge.crazyflie import Crazyflie, Quad, Triple
 from sim_bridge.physics import BodyState
 
 _LEAST_UPRIGHT = 0.5  # cosine of the tilt beyond which the vertical force is no longer kept
@@ -88,6 +88,9 @@ class Controller:
         self._rate_hz = float(physics_hz)
         self._tilt_tan = math.tan(self.gains.tilt_max_rad)
         self._thrust_scale = 1.0 + hover_thrust_error
+        self._weight_n = vehicle.weight_n
+        self._thrust_range_n = (vehicle.idle_thrust_n, vehicle.k_f * vehicle.max_rpm**2)  # of one motor
+        self._mix_lever_m = 4.0 * vehicle.arm_m / math.sqrt(2.0)
         self._last_omega: Triple | None = None
         self._integral: Triple = (0.0, 0.0, 0.0)
 
@@ -135,10 +138,10 @@ class Controller:
 
     def _thrust_vector(self, a_enu: Triple) -> Triple:
         """m (a + g e3), its vertical part within the collective's range, its horizontal part within the tilt limit."""
-        vehicle, gains = self.vehicle, self.gains
-        fx, fy, fz = vehicle.mass_kg * a_enu[0], vehicle.mass_kg * a_enu[1], vehicle.mass_kg * a_enu[2]
-        fz += vehicle.weight_n
-        fz = min(max(fz, gains.least_collective * vehicle.weight_n), gains.most_collective * vehicle.weight_n)
+        mass_kg, weight_n, gains = self.vehicle.mass_kg, self._weight_n, self.gains
+        fx, fy, fz = mass_kg * a_enu[0], mass_kg * a_enu[1], mass_kg * a_enu[2]
+        fz += weight_n
+        fz = min(max(fz, gains.least_collective * weight_n), gains.most_collective * weight_n)
         level, level_max = math.hypot(fx, fy), fz * self._tilt_tan
         if level > level_max:
             fx, fy = fx * level_max / level, fy * level_max / level
@@ -187,23 +190,22 @@ class Controller:
         Inverse of: sum f = collective, sum y f = tau_x, -sum x f = tau_y, sum c (k_m / k_f) f = tau_z. Where one
         motor cannot, roll and pitch come first, then the collective, then yaw.
         """
-        vehicle = self.vehicle
-        least, most = vehicle.idle_thrust_n, vehicle.k_f * vehicle.max_rpm**2
-        lever = 4.0 * vehicle.arm_m / math.sqrt(2.0)
+        least, most = self._thrust_range_n
+        k_f, lever = self.vehicle.k_f, self._mix_lever_m
         roll, pitch = torque_flu[0] / lever, torque_flu[1] / lever
-        tilting = (roll - pitch, roll + pitch, -roll + pitch, -roll - pitch)
-        span = 2.0 * max(tilting)  # the four come in pairs of opposite sign
+        t0, t1 = roll - pitch, roll + pitch  # of the left rotors; those across are their opposites
+        span = 2.0 * max(abs(t0), abs(t1))
         if span > most - least:
             shrink = (most - least) / span
-            tilting = (tilting[0] * shrink, tilting[1] * shrink, tilting[2] * shrink, tilting[3] * shrink)
+            t0, t1 = t0 * shrink, t1 * shrink
             span = most - least
         share = min(max(0.25 * collective_n, least + 0.5 * span), most - 0.5 * span)
-        yaw = torque_flu[2] * vehicle.k_f / (4.0 * vehicle.k_m)
-        for turn, sign in zip(tilting, SPIN_TORQUE_SIGN, strict=True):
-            room = most - share - turn if sign * yaw > 0.0 else share + turn - least
-            yaw = math.copysign(min(abs(yaw), max(room, 0.0)), yaw)
-        f0, f1, f2, f3 = (share + turn + sign * yaw for turn, sign in zip(tilting, SPIN_TORQUE_SIGN, strict=True))
-        k_f = vehicle.k_f
+        yaw = torque_flu[2] * k_f / (4.0 * self.vehicle.k_m)
+        # rotors 1 and 3 (turns t1, -t1) speed up for a positive yaw, 0 and 2 (t0, -t0) slow down
+        up, down = (abs(t1), abs(t0)) if yaw > 0.0 else (abs(t0), abs(t1))
+        room = max(min(most - share - up, share - down - least), 0.0)
+        yaw = min(max(yaw, -room), room)
+        f0, f1, f2, f3 = share + t0 - yaw, share + t1 + yaw, share - t0 - yaw, share - t1 + yaw
         return (math.sqrt(f0 / k_f), math.sqrt(f1 / k_f), math.sqrt(f2 / k_f), math.sqrt(f3 / k_f))
 
 
