@@ -127,12 +127,13 @@ def envelope(cases: Sequence[Case]) -> dict[str, Any]:
 def print_cases(cases: Sequence[Case]) -> None:
     """Two tables for people: the figures, and where a tick's time goes."""
     table = Table(title="a control tick in ms, one vehicle, four obstacles")
-    for column in ("case", "ticks", "p50", "p99", "p99.9", "max", "times real time", "demand"):
+    for column in ("case", "ticks", "p50", "p99", "p99.9", "max", "x real time", "demand", "filter acts"):
         table.add_column(column, justify="left" if column == "case" else "right")
     for case in cases:
         tail = ["-" if value is None else f"{value:.3f}" for value in (case.p50, case.p99, case.p999, case.max)]
         verdict = f"{case.demand:g} {'met' if case.met else '[bold red]missed[/]'}"
-        table.add_row(case.name, str(case.n), *tail, f"{case.factor:.1f}", verdict)
+        acting = "-" if case.acting is None else f"{100.0 * case.acting:.0f} %"
+        table.add_row(case.name, str(case.n), *tail, f"{case.factor:.1f}", verdict, acting)
     where = Table(title="where it goes, ms a tick (the daemon's own by its records: medians)")
     where.add_column("case")
     where.add_column("section")

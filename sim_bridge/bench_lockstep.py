@@ -47,31 +47,35 @@ def measure_lockstep(
     flight = Flight(resolved)
     try:
         with _daemon(resolved, settings) as ports:
-            ticks_ns, factor, _ = _fly(flight, ports, _noting_ticks)
+            ticks_ns, factor, _, acting = _fly(flight, ports, _noting_ticks)
     finally:
         flight.close()
     spent: dict[str, float] = {}
     if sections:
         counted = Sections()
         with sectioned(counted, resolved) as flight, _daemon(resolved, settings) as ports:
-            noted, _, daemon_ms = _fly(flight, ports, lambda runner, wires: _counting(counted, runner, wires))
+            noted, _, daemon_ms, _ = _fly(flight, ports, lambda runner, wires: _counting(counted, runner, wires))
             spent = counted.ms_per(len(noted)) | daemon_ms
-    return case(name, ticks_ns, factor, demand=demand, sections=spent)
+    return case(name, ticks_ns, factor, demand=demand, sections=spent, acting=acting)
 
 
 Ports = tuple[int, int, str]  # onboard, ground station, Zenoh endpoint
 Noting = Callable[[Lockstep, Wires], list[int]]
 
 
-def _fly(flight: Flight, ports: Ports, prepare: Noting) -> tuple[list[int], float, dict[str, float]]:
-    """The ticks [ns] that ``prepare`` notes, the real-time factor, the daemon's own times [ms, medians]."""
+def _fly(flight: Flight, ports: Ports, prepare: Noting) -> tuple[list[int], float, dict[str, float], float]:
+    """The ticks [ns] that ``prepare`` notes, the real-time factor, the daemon's own times [ms, medians], and the
+    share of its flown ticks in which its filter acted."""
     onboard, ground, endpoint = ports
     wires = Wires(flight.resolved, onboard_port=onboard, ground_port=ground, endpoint=endpoint, lockstep=True)
     daemon_ms: defaultdict[str, list[float]] = defaultdict(list)
+    acted: list[bool] = []
 
     def note(index: int, record: Record) -> None:
         for key, value in record.timings_ms.items():
             daemon_ms[key].append(value)
+        if record.state == "ACTIVE":
+            acted.append(record.verdict != "nominal")
 
     try:
         _engage(wires.crafts[0].router.ground.socket.getsockname())
@@ -81,10 +85,10 @@ def _fly(flight: Flight, ports: Ports, prepare: Noting) -> tuple[list[int], floa
         factor = runner.run()["real_time_factor"]
     finally:
         wires.close()
-    if factor is None or not noted:
+    if factor is None or not noted or not acted:
         raise SimError("bench: the daemon did not fly: expected offboard until the scenario's end")
     medians = {f"daemon: {key}": float(np.median(values)) for key, values in daemon_ms.items()}
-    return noted, factor, medians
+    return noted, factor, medians, sum(acted) / len(acted)
 
 
 def _noting_ticks(runner: Lockstep, wires: Wires) -> list[int]:

@@ -70,16 +70,18 @@ def measure(
     *,
     demand: float,
     claim: Callable[[Sections, Law], Law] = lambda sections, law: sections.timed("law", law),
+    acting: Callable[[Law], float] | None = None,
 ) -> Case:
     """The case of ``seconds`` of vehicle time, and a second flight for where the time goes.
 
     Args:
         claim: wraps the law for that second flight.
+        acting: the share of its ticks in which a law's filter acted.
     """
     flight = Flight(resolved)
-    law = make_law()
-    fly(flight, law, 1.0)  # warm
-    ticks_ns = fly(flight, law, seconds)
+    flown = make_law()
+    fly(flight, flown, 1.0)  # warm
+    ticks_ns = fly(flight, flown, seconds)
     flight.close()
     sections = Sections()
     with sectioned(sections, resolved) as flight:
@@ -88,7 +90,8 @@ def measure(
         sections.start()
         spent = sections.ms_per(len(fly(flight, law, min(seconds, 10.0))) + LEAD_TICKS)
     factor = len(ticks_ns) / resolved.scenario.control_hz * NS_PER_S / sum(ticks_ns)
-    return case(name, ticks_ns, factor, demand=demand, sections=spent)
+    acted = None if acting is None else acting(flown)
+    return case(name, ticks_ns, factor, demand=demand, sections=spent, acting=acted)
 
 
 @contextmanager

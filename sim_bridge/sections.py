@@ -83,7 +83,8 @@ class Case(Struct, frozen=True, kw_only=True):
     max: float
     factor: float
     demand: float  # of the factor, at least
-    sections: dict[str, float]  # ms per tick by section, of a run of its own
+    acting: float | None = None  # share of the ticks in which the filter changed the reference; None: no filter
+    sections: dict[str, float] = {}  # ms per tick by section, of a run of its own
 
     @property
     def met(self) -> bool:
@@ -91,7 +92,13 @@ class Case(Struct, frozen=True, kw_only=True):
 
 
 def case(
-    name: str, ticks_ns: Sequence[int], factor: float, *, demand: float, sections: dict[str, float] | None = None
+    name: str,
+    ticks_ns: Sequence[int],
+    factor: float,
+    *,
+    demand: float,
+    sections: dict[str, float] | None = None,
+    acting: float | None = None,
 ) -> Case:
     """A case out of the time of each tick."""
     p50, p99, p999 = (float(value) / 1e6 for value in np.quantile(ticks_ns, (0.5, 0.99, 0.999)))
@@ -105,5 +112,6 @@ def case(
         max=round(max(ticks_ns) / 1e6, 4),
         factor=round(factor, 2),
         demand=demand,
+        acting=None if acting is None else round(acting, 3),
         sections={key: round(value, 4) for key, value in (sections or {}).items()},
     )

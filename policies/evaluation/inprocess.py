@@ -17,7 +17,7 @@ import numpy as np
 
 from companion.config import Config
 from companion.pilot import Pilot, PilotInput
-from companion.types import Detection, DetectionFrame, DetectionKind, VehicleState, frozen
+from companion.types import Detection, DetectionFrame, DetectionKind, VehicleState, Verdict, frozen
 from sim_bridge.bench import scenery
 from sim_bridge.flight import Flight
 from sim_bridge.inprocess import Law, measure
@@ -32,6 +32,7 @@ class BrainLaw:
     def __init__(self, std_m: float) -> None:
         self.pilot = Pilot(Config())
         self._std_m = std_m
+        self.ticks = self.acted = 0  # in all, and those in which the filter changed the reference
         self._sequence = 0
 
     def __call__(self, flight: Flight, frames: Sequence[Frame]) -> Vec3:
@@ -42,7 +43,10 @@ class BrainLaw:
         )
         seen = tuple(self._detections(frame) for frame in frames)
         goal = None if target is None else frozen(np.array(target))
-        x, y, z = self.pilot.step(PilotInput(vehicle, seen, target_enu=goal)).wire.tolist()
+        output = self.pilot.step(PilotInput(vehicle, seen, target_enu=goal))
+        self.ticks += 1
+        self.acted += output.result.verdict is not Verdict.NOMINAL
+        x, y, z = output.wire.tolist()
         return (x, y, z)
 
     def _detections(self, frame: Frame) -> DetectionFrame:
@@ -62,6 +66,12 @@ def claimed(sections: Sections, law: Law) -> Law:
     return sections.timed("brain: rest", law)
 
 
+def acting(law: Law) -> float:
+    """Share of the ticks in which the filter changed the reference."""
+    assert isinstance(law, BrainLaw)
+    return law.acted / law.ticks
+
+
 def main(arguments: list[str]) -> int:
     """Fly SECONDS of vehicle time, print the case."""
     seconds, demand = (float(word) for word in arguments)
@@ -70,7 +80,13 @@ def main(arguments: list[str]) -> int:
     gc.collect()
     gc.freeze()  # as the daemon does
     case = measure(
-        "in process with the brain", resolved, lambda: BrainLaw(std_m), seconds, demand=demand, claim=claimed
+        "in process with the brain",
+        resolved,
+        lambda: BrainLaw(std_m),
+        seconds,
+        demand=demand,
+        claim=claimed,
+        acting=acting,
     )
     sys.stdout.buffer.write(msgspec.json.encode(case))
     return 0

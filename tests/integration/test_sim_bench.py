@@ -31,6 +31,8 @@ def test_the_three_cases_and_where_their_time_goes(
         assert case["met"] == (case["factor"] >= case["demand"])
         assert {"PyBullet", "controller"} <= set(case["sections"])
     assert "law" in plain["sections"]
+    assert plain["acting"] is None
+    assert all(0.0 <= case["acting"] <= 1.0 for case in (brain, lockstep))
     assert {"brain: tracking", "brain: filter", "brain: policy"} <= set(brain["sections"])
     assert {"waiting for the daemon", "Zenoh", "encode", "telemetry", "daemon: brain"} <= set(lockstep["sections"])
 
