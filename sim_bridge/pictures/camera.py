@@ -77,7 +77,7 @@ def overview(points: Array, aspect: float) -> Camera:
     _, _, axes = np.linalg.svd(spread, full_matrices=False)
     along = axes[0] if axes[0] @ (1.0, 0.2) >= 0.0 else -axes[0]
     side = np.array([along[1], -along[0]])  # to the right of it
-    return _fitted(points, np.array([*(side - 0.45 * along), 0.62]), (0.0, 0.0, 1.0), aspect)
+    return _fitted(points, np.array([*(side - 0.45 * along), 0.55]), (0.0, 0.0, 1.0), aspect)
 
 
 def top(points: Array, aspect: float) -> Camera:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,13 @@ from PIL import Image
 from sim_bridge.errors import ScenarioError, SimError
 from sim_bridge.pictures.camera import CameraName, make_camera
 from sim_bridge.pictures.log import Log
-from sim_bridge.pictures.overlay import overlay
-from sim_bridge.pictures.stage import Stage
+from sim_bridge.pictures.overlay import PATH_INKS, overlay
+from sim_bridge.pictures.stage import BALL_COLORS, TARGET, Stage
 
 Size = tuple[int, int]
 SHEET = (3, 3)  # columns and rows of a contact sheet
 _FINER = 2  # the renderer smooths no edges: pictures are taken larger and shrunk
-_COLORS = 96  # of a GIF
+_COLORS = 80  # of a GIF's first picture
 _HOW_TO_INSTALL = "expected imageio-ffmpeg: pip install 'companion-safety[video]', or -o FILE.gif"
 
 
@@ -65,11 +66,25 @@ Writer = Callable[[Path, Iterable[Image.Image], float], None]
 
 
 def write_gif(path: Path, pictures: Iterable[Image.Image], fps: float) -> None:
-    """One palette for the whole film, that of its first picture: colours neither flicker nor cost a table a frame."""
+    """One palette for the whole film: colours neither flicker nor cost a table a frame."""
     frames = iter(pictures)
-    first = next(frames).quantize(_COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    rest = (picture.quantize(palette=first, dither=Image.Dither.NONE) for picture in frames)
-    first.save(path, save_all=True, append_images=rest, duration=round(1000.0 / fps), loop=0, optimize=False)
+    first = next(frames)
+    palette = _palette(first)
+    films = (
+        picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in itertools.chain([first], frames)
+    )
+    start = next(films)
+    start.save(path, save_all=True, append_images=films, duration=round(1000.0 / fps), loop=0, optimize=False)
+
+
+def _palette(first: Image.Image) -> Image.Image:
+    """The colours of the first picture, and those that things have which may not be in it, in light and in shade."""
+    inks = [ink[:3] for ink in PATH_INKS] + [tuple(round(255 * part) for part in c[:3]) for c in (*BALL_COLORS, TARGET)]
+    shades = [round(shade * part) for ink in inks for shade in (1.0, 0.6) for part in ink]
+    seen = first.quantize(_COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*(seen.getpalette() or [])[: 3 * _COLORS], *shades])
+    return palette
 
 
 def write_mp4(path: Path, pictures: Iterable[Image.Image], fps: float) -> None:

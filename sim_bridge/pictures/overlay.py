@@ -36,7 +36,7 @@ def overlay(
     height, width = shot.depth.shape
     layer = Image.new("RGBA", (width, height), (0, 0, 0, 0))
     pen = ImageDraw.Draw(layer)
-    stroke = max(1, round(height / 180))
+    stroke = max(1, round(height / 140))
     for name in ids:
         r, g, b, _ = BALL_COLORS[list(ids).index(name) % len(BALL_COLORS)]
         trail = _ball_trail(log, instant, name)

@@ -35,7 +35,7 @@ _TILES = ((206, 212, 208), (190, 198, 194))
 _BODY: Color = (0.13, 0.15, 0.18, 1.0)
 _FRONT: Color = (0.95, 0.72, 0.08, 1.0)  # rotors at the nose
 _REAR: Color = (0.10, 0.42, 0.75, 1.0)
-_TARGET: Color = (0.16, 0.62, 0.30, 1.0)
+TARGET: Color = (0.16, 0.62, 0.30, 1.0)
 TARGET_RADIUS_M = 0.1  # as drawn
 _AWAY: Triple = (0.0, 0.0, -1000.0)
 _LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -72,7 +72,7 @@ class Stage:
                 name: self._build_ball(ball, radius_m, BALL_COLORS[i % len(BALL_COLORS)])
                 for i, (name, radius_m) in enumerate(balls)
             }
-            self._targets = [self._build_ball(ball, TARGET_RADIUS_M, _TARGET) for _ in first.vehicles]
+            self._targets = [self._build_ball(ball, TARGET_RADIUS_M, TARGET) for _ in first.vehicles]
 
     def show(self, instant: Instant) -> None:
         """Put every body where it is at ``instant``."""
