@@ -150,7 +150,7 @@ def test_refusals_are_one_line_that_names_file_and_key(changes: dict[str, Any], 
 
 
 def test_files_that_are_not_there_or_not_toml(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=r"one of accelerated, demo, empty, linear"):
+    with pytest.raises(ScenarioError, match=r"one of accelerated, bench, demo, empty, linear"):
         load_scenario("no-such")
     with pytest.raises(ScenarioError, match="cannot be read"):
         load_scenario(str(tmp_path / "none.toml"))
