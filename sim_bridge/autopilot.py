@@ -62,6 +62,9 @@ class Autopilot:
     """
 
     kind = 12  # MAV_AUTOPILOT_PX4
+    position_valid = True
+    lockstep = False
+    up_since_ns = 0
     capabilities = 2 | 8 | 16 | 128 | 8192  # float and bytewise parameters, COMMAND_INT, local setpoints, MAVLink 2
     version = 1 << 24 | 15 << 16 | 255  # 1.15.0, release
 
@@ -116,8 +119,11 @@ class Autopilot:
     def manual(self, sticks: Sticks, t_ns: int) -> tuple[Reply, ...]:
         return ()
 
-    def heard_station(self, t_ns: int) -> None:
+    def heard_station(self, t_ns: int, system: int = 255) -> None:
         pass
+
+    def stream_group(self, stream: int) -> tuple[int, ...]:
+        return ()
 
     def battery(self, reading: BatteryReading) -> None:
         pass

@@ -2,33 +2,27 @@
 
 from __future__ import annotations
 
-import json
-import signal
 import socket
-import subprocess
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from sim_bridge.daemon import Daemon, daemon_settings
 from sim_bridge.errors import SimError
 from sim_bridge.flight import Flight
 from sim_bridge.inprocess import sectioned
 from sim_bridge.lockstep_runner import Lockstep
 from sim_bridge.placement import Resolved
-from sim_bridge.runner import Trace
-from sim_bridge.seat import Tap
+from sim_bridge.runner import Tap, Trace
 from sim_bridge.sections import Case, Sections, case
 from sim_bridge.wires import Wires
 from sim_bridge.zenoh_io import Record
 
-STOP_S = 10.0  # the daemon is given this long to end
 _ENGAGE = 92  # MAV_CMD_NAV_GUIDED_ENABLE
 _COMPANION = 196
 
@@ -137,48 +131,19 @@ def _engage(address: tuple[str, int]) -> None:
 
 @contextmanager
 def _daemon(resolved: Resolved, settings: Sequence[str]) -> Iterator[Ports]:
-    """`companion run` on free ports, in lockstep with ``resolved``, until the block ends."""
-    scenario = resolved.scenario
+    """`companion run` on free ports, in lockstep with ``resolved`` and with its log, until the block ends."""
+    scenario, vehicle = resolved.scenario, resolved.scenario.fleet[0]
     onboard, ground = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
     endpoint = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
-    position = scenario.target_of(scenario.fleet[0])
-    keys: dict[str, Any] = {
-        "mavlink.url": f"udpin://127.0.0.1:{onboard}",
-        "mavlink.system_id": 1,
-        "zenoh.connect": [endpoint],
-        "tick_hz": scenario.control_hz,
-        "sync": "lockstep",
-        "lockstep_sources": [sensor.source for sensor in scenario.sensors],
-    }
-    if position is not None:
-        keys["target.position"] = list(position)
-    with TemporaryDirectory(prefix="sim-bridge-bench-") as folder:
-        keys["log.directory"] = folder
-        config, said = Path(folder, "companion.toml"), Path(folder, "companion.log")
-        config.write_text("", encoding="utf-8")
-        words = [word for key, value in keys.items() for word in ("--set", f"{key}={json.dumps(value)}")]
-        words += [word for setting in settings for word in ("--set", setting)]
-        command = [sys.executable, "-m", "companion.cli", "run", "-c", str(config), *words]
-        with said.open("wb") as log:
-            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log)
+    tied = daemon_settings(scenario, vehicle, onboard_port=onboard, endpoint=endpoint, lockstep=True)
+    with (
+        TemporaryDirectory(prefix="sim-bridge-bench-") as folder,
+        Daemon(vehicle.name, (*tied, *settings), Path(folder), log_flight=True) as daemon,
+    ):
         try:
             yield onboard, ground, endpoint
         except SimError as error:
-            process.kill()
-            last = (said.read_text(errors="replace").strip().splitlines() or ["it said nothing"])[-1]
-            raise SimError(f"{error}; the daemon: {last}") from None
-        finally:
-            _end(process)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.send_signal(signal.SIGTERM)
-    try:
-        process.wait(STOP_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+            raise SimError(f"{error}; the daemon: {daemon.last_words()}") from None
 
 
 def _free_port(kind: socket.SocketKind) -> int:

@@ -10,10 +10,12 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import IO, Any
 
 from sim_bridge import bench, render
+from sim_bridge.check import check
 from sim_bridge.errors import ScenarioError, SimError
 from sim_bridge.flight import Flight
 from sim_bridge.lockstep_runner import Lockstep
@@ -70,6 +72,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="ENDPOINT",
         help="where Zenoh listens (default tcp/127.0.0.1:7447), or none",
     )
+    run.add_argument(
+        "--check", action="store_true", help="fly with a daemon for each vehicle; which of the expectations failed?"
+    )
+    run.add_argument("--real-time", action="store_true", help="with --check: at the pace of the clock, not in lockstep")
+    run.add_argument("--logs", type=Path, metavar="FOLDER", help="with --check: keep what the daemons log here")
     run.add_argument("--trace", type=Path, metavar="FILE", help="write true positions as JSON lines")
     run.set_defaults(run=_run)
     show = commands.add_parser(
@@ -138,6 +145,11 @@ def _schema(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    if arguments.check:
+        return _check(arguments)
+    for option in ("real_time", "logs"):
+        if getattr(arguments, option):
+            raise ScenarioError(f"--{option.replace('_', '-')}: expected --check with it")
     resolved = _resolved(arguments)
     endpoint = None if arguments.zenoh_listen == _NO_ZENOH else arguments.zenoh_listen
     if arguments.lockstep and endpoint is None:
@@ -170,6 +182,41 @@ def _run(arguments: argparse.Namespace) -> int:
             summary = runner.run()
     _report(summary, as_json=arguments.json)
     return FAILED if summary["collided"] or summary["ended"] == "timeout" else DONE
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    for option in ("lockstep", "stay", "name"):
+        if getattr(arguments, option):
+            raise ScenarioError(f"--{option}: expected none with --check, which flies in lockstep unless --real-time")
+    name, scenario = load_scenario(arguments.scenario)
+    with ExitStack() as stack:
+        folder: Path = arguments.logs or Path(stack.enter_context(TemporaryDirectory(prefix="sim-bridge-check-")))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ScenarioError(f"--logs {folder}: cannot be made ({error.strerror})") from None
+        result = check(
+            name,
+            scenario,
+            arguments.seed,
+            folder=folder,
+            lockstep=not arguments.real_time,
+            trace=stack.enter_context(_opened(arguments.trace)),
+            progress=_progress(),
+            log_flight=arguments.logs is not None,
+            obstacles=not arguments.no_obstacles,
+            on_stop=lambda stop: stack.enter_context(_stopped_by_signals(stop)),
+        )
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    if arguments.json:
+        print(json.dumps(result.report()))
+    else:
+        for finding in result.findings:
+            print(finding.line())
+        met = sum(finding.met for finding in result.findings)
+        print(f"{name}, seed {arguments.seed}: {met} of {len(result.findings)} expectations met")
+    return DONE if result.passed else FAILED
 
 
 @contextmanager

@@ -87,10 +87,11 @@ class Controller:
         self.gains = Gains() if gains is None else gains
         self._rate_hz = float(physics_hz)
         self._tilt_tan = math.tan(self.gains.tilt_max_rad)
-        self._thrust_scale = 1.0 + hover_thrust_error
+        # the vehicle's derived figures, once: these loops run every physics step
         self._weight_n = vehicle.weight_n
-        self._thrust_range_n = (vehicle.idle_thrust_n, vehicle.k_f * vehicle.max_rpm**2)  # of one motor
-        self._mix_lever_m = 4.0 * vehicle.arm_m / math.sqrt(2.0)
+        self._least_n, self._most_n = vehicle.idle_thrust_n, vehicle.k_f * vehicle.max_rpm**2
+        self._lever_m = 4.0 * vehicle.arm_m / math.sqrt(2.0)
+        self._thrust_scale = 1.0 + hover_thrust_error
         self._last_omega: Triple | None = None
         self._integral: Triple = (0.0, 0.0, 0.0)
 
@@ -190,8 +191,7 @@ class Controller:
         Inverse of: sum f = collective, sum y f = tau_x, -sum x f = tau_y, sum c (k_m / k_f) f = tau_z. Where one
         motor cannot, roll and pitch come first, then the collective, then yaw.
         """
-        least, most = self._thrust_range_n
-        k_f, lever = self.vehicle.k_f, self._mix_lever_m
+        least, most, lever, k_f = self._least_n, self._most_n, self._lever_m, self.vehicle.k_f
         roll, pitch = torque_flu[0] / lever, torque_flu[1] / lever
         t0, t1 = roll - pitch, roll + pitch  # of the left rotors; those across are their opposites
         span = 2.0 * max(abs(t0), abs(t1))

@@ -21,8 +21,8 @@ from sim_bridge.craft import Craft
 from sim_bridge.errors import ScenarioError
 from sim_bridge.flight import Flight
 from sim_bridge.impairments import Channel, Impairment, damage_message
-from sim_bridge.messages import FORCE_DISARM, NS_PER_S, Cmd, Command, Reply, Sender
-from sim_bridge.pilot import Pilot
+from sim_bridge.messages import NS_PER_S, Cmd, Command, Reply, Sender
+from sim_bridge.pilot import Pilot, switch_command
 from sim_bridge.scenario_faults import LINKS, Fault
 from sim_bridge.station import Station
 from sim_bridge.wires import CraftWires, Feed, damage_frame
@@ -30,6 +30,7 @@ from sim_bridge.wires import CraftWires, Feed, damage_frame
 T = TypeVar("T")
 
 _FOREVER_S = 1e6
+_FORCE = 21196.0  # param2 of COMPONENT_ARM_DISARM: in the air too
 _FAULT_DRAWS = 2  # what these generators are for, beside the obstacles' jitter (0) and the sensors (1)
 
 
@@ -44,6 +45,9 @@ class Process(Protocol):
 
     def kill(self) -> None:
         """SIGKILL."""
+
+    def check_alive(self) -> None:
+        """Raise SimError where it has ended by itself."""
 
 
 @dataclass(slots=True)
@@ -105,6 +109,7 @@ class Faults:
         self._stations = stations
         started = processes or {}
         self.companions = tuple(Companion(started.get(craft.vehicle.name)) for craft in wires)
+        self._processes = tuple(started.values())
         self.hits = tuple(self._planned())
         self._pilots: dict[int, Pilot] = {}
         for hit in self.hits:
@@ -117,6 +122,11 @@ class Faults:
             hit.craft == craft and (hit.fault.on == "onboard" or hit.fault.what in ("freeze", "clock_jump"))
             for hit in self.hits
         )
+
+    def check_daemons(self) -> None:
+        """Raise SimError where a daemon that this process has started has ended by itself."""
+        for process in self._processes:
+            process.check_alive()
 
     def step(self) -> None:
         """Start and end what is due now; once at the beginning of every control period."""
@@ -146,6 +156,10 @@ class Faults:
     def _check(self, hit: Hit) -> None:
         if hit.fault.on == "daemon" and self.companions[hit.craft].process is None:
             raise ScenarioError(f"faults[{hit.index}]: expected --check, which starts the daemon, for {hit.fault.what}")
+        if hit.fault.what == "gps":
+            raise ScenarioError(f"faults[{hit.index}]: what: expected another, no autopilot here can lose its position")
+        if hit.fault.what == "rc":
+            switch_command(self._flight.crafts[hit.craft], _mode_of(hit.fault))  # raises for a mode that is none
 
     def _open_channels(self, hit: Hit) -> None:
         """Channels stand for the whole flight, so that how messages leave does not change when a fault begins."""
@@ -217,7 +231,7 @@ class Faults:
                 hit.undo.append(partial(_shift, feed, -_value_ns(hit.fault)))
                 continue
             assert feed.channel is not None, "opened when the flight began"
-            self._impair(hit, feed.channel, way, damage_frame, repeat=feed.again)
+            self._impair(hit, feed.channel, way, damage_frame)
 
     def _impair(
         self,
@@ -225,7 +239,6 @@ class Faults:
         channel: Channel[T],
         way: int,
         damage: Callable[[T, np.random.Generator], T],
-        repeat: Callable[[T, T], T] | None = None,
     ) -> None:
         fault = hit.fault
         timed_rng, wall_rng = (
@@ -239,7 +252,6 @@ class Faults:
             rng=timed_rng,
             wall_rng=wall_rng,
             damage=damage,
-            repeat=repeat,
         )
         channel.impairments.append(impairment)
         hit.undo.append(lambda: channel.remove(impairment))
@@ -248,7 +260,7 @@ class Faults:
         what = hit.fault.what
         if what == "kill":
             craft = self._flight.crafts[hit.craft]
-            stop = Command(Cmd.COMPONENT_ARM_DISARM, (0.0, FORCE_DISARM, 0, 0, 0, 0, 0), Sender(craft.system_id, 1))
+            stop = Command(Cmd.COMPONENT_ARM_DISARM, (0.0, _FORCE, 0.0, 0.0, 0.0, 0.0, 0.0), Sender(craft.system_id, 1))
             replies = craft.autopilot.command(stop, craft.state, self._flight.t_ns)
             self._say(hit.craft, replies)
         elif what == "clock_jump":
@@ -261,8 +273,7 @@ class Faults:
 
     def _take_over(self, hit: Hit) -> None:
         pilot = self._pilots.setdefault(hit.craft, Pilot(self._flight.crafts[hit.craft]))
-        mode = hit.fault.value
-        self._say(hit.craft, pilot.take_over(mode if isinstance(mode, str) else None, self._flight.t_ns))
+        self._say(hit.craft, pilot.take_over(_mode_of(hit.fault), self._flight.t_ns))
         hit.undo.append(pilot.let_go)
 
     def _hit_sensors(self, hit: Hit, craft: Craft) -> None:
@@ -292,6 +303,10 @@ class Faults:
 
 def _value_ns(fault: Fault) -> int:
     return round(fault.value * NS_PER_S) if isinstance(fault.value, float) else 0
+
+
+def _mode_of(fault: Fault) -> str | None:
+    return fault.value if isinstance(fault.value, str) else None
 
 
 def _shift(feed: Feed, by_ns: int) -> None:

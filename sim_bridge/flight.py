@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from sim_bridge.ardupilot import ArduCopter
 from sim_bridge.autopilot import Autopilot
 from sim_bridge.controller import Controller, Gains
 from sim_bridge.craft import Craft
@@ -22,6 +23,8 @@ from sim_bridge.sensors import Sensor, sensor_of
 
 _GUSTS, _ESTIMATOR = 0, 1  # effects that draw
 _INTEGRAL_HZ2 = 2.0  # PX4's MPC_Z_VEL_I_ACC
+
+AUTOPILOTS: dict[str, type[Autopilot] | type[ArduCopter]] = {"px4": Autopilot, "ardupilot": ArduCopter}
 
 
 class Flight:
@@ -98,9 +101,9 @@ class Flight:
             if craft.judge is None and craft.external:
                 self._begin(craft)
         self.world.step([craft.command() for craft in self.crafts])
-        at_tick = self.at_tick
+        t_ns, at_tick = self.world.t_ns, self.at_tick
         for craft in self.crafts:
-            craft.follow(at_tick=at_tick)
+            craft.follow(t_ns, at_tick=at_tick)
 
     def _begin(self, craft: Craft) -> None:
         if self._started_ns is None:
@@ -161,9 +164,7 @@ class Flight:
 
 def _autopilot(scenario: Scenario, spec: Vehicle, model: Crazyflie) -> Personality:
     """The autopilot of one vehicle, with the parameters of its table."""
-    if spec.personality != "px4":
-        raise ScenarioError(f"{spec.name}: personality: expected px4, got {spec.personality}")
-    autopilot = Autopilot(
+    autopilot = AUTOPILOTS[spec.personality](
         start_enu=spec.start,
         rest_height_m=model.radius_m,
         yaw_rad=spec.yaw_rad,
@@ -171,7 +172,8 @@ def _autopilot(scenario: Scenario, spec: Vehicle, model: Crazyflie) -> Personali
         physics_hz=scenario.physics_hz,
     )
     parameters = autopilot.parameters
-    parameters.write("MIS_TAKEOFF_ALT", spec.takeoff_altitude_m, is_int=False)
+    if "MIS_TAKEOFF_ALT" in parameters.names:
+        parameters.write("MIS_TAKEOFF_ALT", spec.takeoff_altitude_m, is_int=False)
     for name, value in spec.parameters.items():
         if name not in parameters.names:
             raise ScenarioError(f"{spec.name}: parameters: expected a parameter of {spec.personality}, got {name}")

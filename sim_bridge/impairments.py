@@ -34,11 +34,10 @@ class Impairment(Generic[T]):
 
     Args:
         kind: of `KINDS`. drop: lost; delay: ``delay_ns`` late; duplicate: twice; reorder: after the next message;
-            corrupt: one byte changed; cut: lost, whatever it is; freeze: ``repeat`` makes of each the first again.
+            corrupt: one byte changed; cut: lost, whatever it is; freeze: the first comes again and again.
         share: of the messages, 0 to 1; cut and freeze hit all.
         rng, wall_rng: the chance for timed messages, and for those timed by the wall clock.
         damage: a message with one byte changed (corrupt).
-        repeat: (first message since the start, this one) to what is sent instead (freeze).
     """
 
     def __init__(
@@ -50,7 +49,6 @@ class Impairment(Generic[T]):
         rng: np.random.Generator,
         wall_rng: np.random.Generator,
         damage: Callable[[T, np.random.Generator], T],
-        repeat: Callable[[T, T], T] | None = None,
     ) -> None:
         if kind not in KINDS:
             raise ValueError(f"impairment: expected one of {', '.join(KINDS)}, got {kind}")
@@ -60,8 +58,7 @@ class Impairment(Generic[T]):
         self._rng = rng
         self._wall_rng = wall_rng
         self._damage = damage
-        self._repeat = repeat
-        self._first: T | None = None
+        self._first: Passage[T] | None = None
         self._held: list[Passage[T]] = []
 
     def apply(self, passage: Passage[T], timed: bool) -> list[tuple[int, Passage[T]]]:
@@ -69,7 +66,8 @@ class Impairment(Generic[T]):
         if self.kind == "cut":
             return []
         if self.kind == "freeze":
-            return [(0, self._frozen(passage))]
+            self._first = self._first or passage
+            return [(0, self._first)]
         rng = self._rng if timed else self._wall_rng
         hit = bool(rng.random() < self._share)
         if self.kind == "reorder":
@@ -88,11 +86,6 @@ class Impairment(Generic[T]):
         """The fault is over: what it still holds."""
         held, self._held = self._held, []
         return held
-
-    def _frozen(self, passage: Passage[T]) -> Passage[T]:
-        if self._first is None:
-            self._first = passage.item
-        return passage if self._repeat is None else Passage(self._repeat(self._first, passage.item), passage.intact)
 
     def _swap(self, passage: Passage[T], hit: bool, timed: bool) -> list[Passage[T]]:
         if not timed:

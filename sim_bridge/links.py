@@ -71,8 +71,12 @@ class Link:
             self._corked = []
 
     def uncork(self) -> list[Passage[bytes]]:
-        """Send what was held back as one datagram; returns its messages."""
+        """Send what was held back as one datagram; returns its messages, damaged ones last.
+
+        A receiver that looks for the next packet inside a damaged one may take what follows it for a part of that.
+        """
         corked, self._corked = self._corked or [], None
+        corked = [p for p in corked if p.intact] + [p for p in corked if not p.intact]
         size = 0
         for at in range(len(corked) - 1, -1, -1):
             size += len(corked[at].item)

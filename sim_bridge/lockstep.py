@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
+from sim_bridge.craft import Craft
 from sim_bridge.errors import SimError
 from sim_bridge.mavlink import Packet
 from sim_bridge.messages import Cmd, Command
@@ -19,6 +20,7 @@ from sim_bridge.scenario import OperatorStep
 COMPANION = 196  # MAV_COMP_ID_OBSTACLE_AVOIDANCE
 UNCOUNTED_IDS = {0, 22, 148, 247, 390}  # heartbeats, and what is timed by the wall clock: no part of a tick's answer
 SETPOINT_ID = 84
+_HOLDS = ((4.0, 3.0), (17.0, 0.0), (5.0, 0.0))  # DO_SET_MODE of hold: PX4's AUTO.LOITER, ArduCopter's BRAKE, LOITER
 
 
 class LockstepStalled(SimError):
@@ -123,6 +125,17 @@ class Desk:
         self._next += 1
 
 
+def step_due(step: OperatorStep, craft: Craft, period_ns: int, *, ended: bool) -> bool:
+    """Whether it is time for ``step`` of ``craft``; ``ended``: the flight is over."""
+    if step.at_tick is not None:
+        return craft.t_ns >= step.at_tick * period_ns
+    if step.after == "airborne_hover":
+        return craft.autopilot.hovering(craft.t_ns)
+    if step.after == "on_ground":
+        return not craft.autopilot.airborne
+    return ended
+
+
 def _identity(command: Command) -> tuple[object, ...]:
     """Equal for a command and its repetition; NaN parameters count as equal."""
     params = struct.pack("<7d", *command.params)
@@ -134,5 +147,5 @@ def _belongs(step: OperatorStep, command: Command) -> bool:
     if command.command != number or command.target_component not in ({1: (0, 1)}.get(component, (component,))):
         return False
     if number == Cmd.DO_SET_MODE:
-        return command.params[1:3] == (4.0, 3.0)  # PX4's AUTO.LOITER
+        return command.params[1:3] in _HOLDS
     return param1 is None or command.params[0] == param1

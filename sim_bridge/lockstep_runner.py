@@ -20,8 +20,8 @@ from sim_bridge.faults import Faults, Process
 from sim_bridge.flight import Flight
 from sim_bridge.lockstep import Desk, LockstepStalled
 from sim_bridge.messages import NS_PER_S
-from sim_bridge.runner import Operator, Trace, outcome, stations_of
-from sim_bridge.seat import REMIND_S, Seat, Tap, named, steps_of
+from sim_bridge.runner import Operator, Tap, Trace, outcome, stations_of
+from sim_bridge.seat import REMIND_S, Seat, named, steps_of
 from sim_bridge.telemetry import ALIVE, HEARTBEAT
 from sim_bridge.wires import Wires
 
@@ -114,6 +114,14 @@ class Lockstep:
             marks.append(time.perf_counter())
             self._account(marks)
         return {**outcome(flight), **self._timing(began)}
+
+    def serve(self, wait_s: float) -> None:
+        """After the flight: answer on the links for at most ``wait_s`` of wall time, time standing still."""
+        for seat in self._seats:
+            seat.router.onboard.uncork()
+        self._stay_alive(time.monotonic())
+        self._wires.wait(wait_s)
+        self._receive()
 
     # --- phases of a tick
 
@@ -211,6 +219,7 @@ class Lockstep:
             now = time.monotonic()
             if now >= deadline:
                 raise LockstepStalled(f"lockstep: after {limit_s:g} s: {missing()} (held at {self.flight.t_ns} ns)")
+            self.faults.check_daemons()
             self._stay_alive(now)
             self._wires.wait(_POLL_S)
             self._receive()

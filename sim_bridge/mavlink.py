@@ -23,6 +23,7 @@ from sim_bridge.messages import (
     ParamRead,
     ParamWrite,
     Sender,
+    StreamRequest,
     Text,
     Timesync,
     Vec3,
@@ -121,7 +122,7 @@ def _command_int(m: Any, sender: Sender) -> Command:
 def _set_mode(m: Any, sender: Sender) -> Command:
     main, sub = float(m.custom_mode >> 16 & 0xFF), float(m.custom_mode >> 24)
     params = (float(m.base_mode), main, sub, 0.0, 0.0, 0.0, 0.0)
-    return Command(Cmd.DO_SET_MODE, params, sender, m.target_system, COMPONENT)
+    return Command(Cmd.DO_SET_MODE, params, sender, m.target_system, COMPONENT, m.custom_mode)
 
 
 def _setpoint(m: Any, sender: Sender) -> LocalSetpoint:
@@ -144,8 +145,9 @@ def _timesync(m: Any, sender: Sender) -> Timesync | None:
 
 def _param_set(m: Any, sender: Sender) -> ParamWrite:
     if m.param_type in _INT_TYPES:
-        return ParamWrite(m.param_id, struct.unpack("<i", struct.pack("<f", m.param_value))[0], is_int=True)
-    return ParamWrite(m.param_id, m.param_value, is_int=False)
+        whole = struct.unpack("<i", struct.pack("<f", m.param_value))[0]
+        return ParamWrite(m.param_id, whole, is_int=True, cast=m.param_value)
+    return ParamWrite(m.param_id, m.param_value, is_int=False, cast=m.param_value)
 
 
 _READERS: dict[str, Callable[[Any, Sender], Incoming | None]] = {
@@ -157,6 +159,7 @@ _READERS: dict[str, Callable[[Any, Sender], Incoming | None]] = {
     "PARAM_REQUEST_READ": lambda m, sender: ParamRead("" if m.param_index >= 0 else m.param_id, m.param_index),
     "PARAM_REQUEST_LIST": lambda m, sender: ParamRead("", -1),
     "PARAM_SET": _param_set,
+    "REQUEST_DATA_STREAM": lambda m, sender: StreamRequest(m.req_stream_id, m.req_message_rate if m.start_stop else 0),
 }
 
 
@@ -185,8 +188,11 @@ class Encoder:
         """The answer; pymavlink's dialect has no target fields here, so whoever sent ``ts1`` knows it by that."""
         return self.pack(dialect.MAVLink_timesync_message(now_ns, request.ts1))
 
-    def param(self, name: str, value: float | int, index: int, count: int) -> bytes:
-        if isinstance(value, int):
+    def param(self, name: str, value: float | int, index: int, count: int, *, cast_to: int | None = None) -> bytes:
+        """PARAM_VALUE; ``cast_to``: MAV_PARAM_TYPE of a number that travels as a plain float, else bytewise."""
+        if cast_to is not None:
+            wire, kind = float(value), cast_to
+        elif isinstance(value, int):
             wire, kind = struct.unpack("<f", struct.pack("<i", value))[0], _PARAM_INT32
         else:
             wire, kind = value, _PARAM_REAL32

@@ -5,7 +5,8 @@ Numbers are those of MAVLink's common dialect (MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from typing import TypeAlias
 
@@ -51,6 +52,7 @@ class Result(IntEnum):
     TEMPORARILY_REJECTED = 1
     DENIED = 2
     UNSUPPORTED = 3
+    FAILED = 4
 
 
 class Severity(IntEnum):
@@ -65,10 +67,12 @@ class Severity(IntEnum):
 class Cmd(IntEnum):
     """The MAV_CMDs that something here answers."""
 
+    NAV_RETURN_TO_LAUNCH = 20
     NAV_LAND = 21
     NAV_TAKEOFF = 22
     NAV_GUIDED_ENABLE = 92
     DO_SET_MODE = 176
+    PREFLIGHT_REBOOT_SHUTDOWN = 246
     COMPONENT_ARM_DISARM = 400
     GET_MESSAGE_INTERVAL = 510
     SET_MESSAGE_INTERVAL = 511
@@ -93,6 +97,7 @@ class Command:
     sender: Sender
     target_system: int = 1
     target_component: int = 1
+    custom_mode: int | None = field(default=None, compare=False)  # SET_MODE's, of which params hold PX4's parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,10 +167,27 @@ class ParamWrite:
     name: str
     value: float | int
     is_int: bool
+    cast: float = field(default=math.nan, compare=False)  # as a plain float: the value under C_CAST
+
+
+@dataclass(frozen=True, slots=True)
+class StreamRequest:
+    """REQUEST_DATA_STREAM: all messages of a MAV_DATA_STREAM at ``rate_hz``, 0 off."""
+
+    stream: int
+    rate_hz: int
 
 
 Incoming: TypeAlias = (
-    Command | LocalSetpoint | AttitudeTarget | Sticks | StationHeartbeat | Timesync | ParamRead | ParamWrite
+    StreamRequest
+    | Command
+    | LocalSetpoint
+    | AttitudeTarget
+    | Sticks
+    | StationHeartbeat
+    | Timesync
+    | ParamRead
+    | ParamWrite
 )
 
 

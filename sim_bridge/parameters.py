@@ -55,6 +55,10 @@ class Parameters:
     def is_int(self, name: str) -> bool:
         return isinstance(DEFINITIONS[name].default, int)
 
+    def cast_to(self, name: str) -> int | None:
+        """None: values travel bytewise."""
+        return None
+
     def write(self, name: str, value: float | int, *, is_int: bool) -> bool:
         """Set a known parameter; False (and unchanged) for a wrong type or a value out of range."""
         definition = DEFINITIONS[name]

@@ -50,6 +50,9 @@ class ParameterTable(Protocol):
 
     def is_int(self, name: str) -> bool: ...
 
+    def cast_to(self, name: str) -> int | None:
+        """MAV_PARAM_TYPE of a parameter that travels as a plain float (C_CAST); None: bytewise."""
+
     def write(self, name: str, value: float | int, *, is_int: bool) -> bool:
         """Set a known parameter; False (and unchanged) for a wrong type or a value out of range."""
 
@@ -58,9 +61,21 @@ class Personality(Protocol):
     """One vehicle's autopilot."""
 
     kind: int  # MAV_AUTOPILOT
-    armed: bool
-    landed: Landed
-    home_enu: Vec3
+    lockstep: bool  # set by the station: the state streams from the start, at the control rate
+    up_since_ns: int  # flight time of its last boot, which its clock counts from; it is silent before
+
+    @property
+    def armed(self) -> bool: ...
+
+    @property
+    def landed(self) -> Landed: ...
+
+    @property
+    def home_enu(self) -> Vec3: ...
+
+    @property
+    def position_valid(self) -> bool:
+        """Its estimator has a position to tell."""
 
     @property
     def custom_mode(self) -> int:
@@ -100,6 +115,9 @@ class Personality(Protocol):
     def max_rate_hz(self) -> float:
         """The fastest stream that can be asked for."""
 
+    def stream_group(self, stream: int) -> tuple[int, ...]:
+        """Messages of a MAV_DATA_STREAM; none where REQUEST_DATA_STREAM is not served."""
+
     def rates_hz(self, link: LinkName) -> Mapping[int, float]:
         """What streams unasked on ``link``: message id to rate."""
 
@@ -115,8 +133,8 @@ class Personality(Protocol):
     def manual(self, sticks: Sticks, t_ns: int) -> tuple[Reply, ...]:
         """Take MANUAL_CONTROL or RC_CHANNELS_OVERRIDE."""
 
-    def heard_station(self, t_ns: int) -> None:
-        """A ground station's heartbeat came."""
+    def heard_station(self, t_ns: int, system: int = 255) -> None:
+        """The heartbeat of the ground station ``system`` came."""
 
     def battery(self, reading: BatteryReading) -> None:
         """The power monitor's newest reading."""

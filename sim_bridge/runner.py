@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import IO, Any, Protocol
 
 import msgspec
 
 from sim_bridge.faults import Faults, Process
 from sim_bridge.flight import Flight
+from sim_bridge.mavlink import Packet
 from sim_bridge.messages import NS_PER_S
 from sim_bridge.scenario import OperatorStep
 from sim_bridge.station import Station
 from sim_bridge.wires import CraftWires, Wires
+from sim_bridge.zenoh_io import Record
 
 _LATE_NS = NS_PER_S // 4  # of wall time: further behind the clock than this, time is given up, not caught up
 
@@ -30,6 +33,14 @@ class Operator(Protocol):
 
     def give(self, vehicle: int, step: OperatorStep, t_ns: int) -> None:
         """Lockstep: send the command of a step that is due, now or again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tap:
+    """What an observer of a flight is told of the daemons, each with the vehicle's index."""
+
+    record: Callable[[int, Record], None]
+    packet: Callable[[int, Packet], None]  # as it arrived, whatever a fault then makes of it
 
 
 class Trace:
@@ -53,6 +64,7 @@ class RealTime:
         speed: vehicle time over wall time, as PX4's PX4_SIM_SPEED_FACTOR; every clock of the vehicle runs as fast.
         processes: daemons that faults may freeze and kill, by vehicle name.
         operator: plays the scenario's steps; None: someone at the ground links does, at will.
+        tap: told what the daemons say, by Zenoh too if there is a session.
     """
 
     def __init__(
@@ -66,11 +78,16 @@ class RealTime:
         speed: float = 1.0,
         processes: Mapping[str, Process] | None = None,
         operator: Operator | None = None,
+        tap: Tap | None = None,
     ) -> None:
         self.flight = flight
         self.stations = stations_of(flight, wires, clock_ns=self._clock_ns, lockstep=False)
         self.faults = Faults(flight, wires.crafts, self.stations, processes)
         self._operator = operator
+        self._tap = tap
+        for own in wires.crafts if tap is not None else ():
+            if own.bridge is not None:
+                own.bridge.listen()
         self._speed = speed
         self._wires = wires
         self._trace = trace
@@ -111,9 +128,18 @@ class RealTime:
         """The vehicle's clock now."""
         return round((time.monotonic_ns() - self._epoch_ns) * self._speed)
 
+    def serve(self, wait_s: float) -> None:
+        """After the flight: answer on the links for at most ``wait_s`` of wall time."""
+        self._wires.wait(wait_s)
+        self._receive()
+        self._stream()
+
     def _receive(self) -> None:
-        for own, station in self._vehicles():
+        for index, (own, station) in enumerate(self._vehicles()):
+            self._observe(index, own)
             for link, packet in own.router.receive():
+                if self._tap is not None and link is own.router.onboard:
+                    self._tap.packet(index, packet)
                 for each in link.impaired(packet):
                     own.router.forward(link, each)
                     station.handle(link, each)
@@ -128,6 +154,7 @@ class RealTime:
 
     def _tick(self) -> None:
         flight = self.flight
+        self.faults.check_daemons()
         self.faults.step()
         if self._operator is not None:
             self._operator.tick(flight.t_ns)
@@ -151,6 +178,11 @@ class RealTime:
                     for payload in feed.due(craft, craft.t_ns, station.clock_offset_ns):
                         own.bridge.publish_frame(feed.source, payload)
             station.stream(*own.router.links)
+
+    def _observe(self, index: int, own: CraftWires) -> None:
+        if self._tap is not None and own.bridge is not None:
+            for record in own.bridge.records():
+                self._tap.record(index, record)
 
     def _vehicles(self) -> Iterator[tuple[CraftWires, Station]]:
         return zip(self._wires.crafts, self.stations, strict=True)

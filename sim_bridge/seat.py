@@ -9,30 +9,22 @@ messages and frames wait with it (the simulator plays the kernel's buffers), a d
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from sim_bridge.craft import Craft
 from sim_bridge.delivery import Delivery
 from sim_bridge.faults import Companion
 from sim_bridge.links import Link
-from sim_bridge.lockstep import COMPANION, UNCOUNTED_IDS, Answer, Desk, LockstepStalled, Offer
+from sim_bridge.lockstep import COMPANION, UNCOUNTED_IDS, Answer, Desk, LockstepStalled, Offer, step_due
 from sim_bridge.mavlink import Packet
 from sim_bridge.messages import NS_PER_S, Ack, Command, Reply
+from sim_bridge.runner import Tap
 from sim_bridge.scenario import OperatorStep
 from sim_bridge.station import Station
 from sim_bridge.wires import CraftWires
-from sim_bridge.zenoh_io import Bridge, Record
+from sim_bridge.zenoh_io import Bridge
 
 FRAMES_KEPT = 64  # of a source, for a frozen companion: its own queue is as long
 REMIND_S = 0.05  # of wall time, after a reboot: the marker again, until it is answered
-
-
-@dataclass(slots=True)
-class Tap:
-    """What an observer of a flight is told, each with the vehicle's index."""
-
-    record: Callable[[int, Record], None]
-    packet: Callable[[int, Packet], None]  # of the companion, as it arrived
 
 
 class Seat:
@@ -220,13 +212,7 @@ class Seat:
 
     def due(self, step: OperatorStep, ended: bool) -> bool:
         """Whether it is time for ``step``; ``ended``: the flight is over."""
-        if step.at_tick is not None:
-            return self.craft.t_ns >= step.at_tick * self._period_ns
-        if step.after == "airborne_hover":
-            return self.craft.autopilot.hovering(self.craft.t_ns)
-        if step.after == "on_ground":
-            return not self.craft.autopilot.airborne
-        return ended
+        return step_due(step, self.craft, self._period_ns, ended=ended)
 
     def apply(self, step: OperatorStep, offer: Offer, await_ack: Callable[[Seat, int, str], None]) -> bytes:
         """Carry out a step now; returns the acknowledgement that repetitions of its command get.

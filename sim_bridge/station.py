@@ -19,6 +19,7 @@ from sim_bridge.messages import (
     Result,
     StationHeartbeat,
     Sticks,
+    StreamRequest,
     Text,
     Timesync,
 )
@@ -72,22 +73,38 @@ class Station:
         self._router = router
         self._t_ns = t_ns
         self._clock_ns = clock_ns
-        self._streams = {
-            link: Streams(
-                self._autopilot.rates_hz(link.name),
-                max_hz=self._autopilot.max_rate_hz,
-                pinned=_LOCKSTEP_PINNED if lockstep and link is router.onboard else frozenset(),
-            )
-            for link in router.links
-        }
+        self._autopilot.lockstep = lockstep
+        self._boot_ns = self._autopilot.up_since_ns
+        self._streams = self._fresh_streams()
         self.clock_offset_ns = 0  # by which the vehicle's clock has jumped (faults)
         self.on_text: Callable[[Text], None] = lambda text: None
         self._announced = self._status()
 
+    def _fresh_streams(self) -> dict[Link, Streams]:
+        """As after boot: what was asked for is forgotten."""
+        pinned = _LOCKSTEP_PINNED if self._autopilot.lockstep else frozenset()
+        return {
+            link: Streams(
+                self._autopilot.rates_hz(link.name),
+                max_hz=self._autopilot.max_rate_hz,
+                pinned=pinned if link is self._router.onboard else frozenset(),
+            )
+            for link in self._router.links
+        }
+
+    def _up(self) -> bool:
+        """Whether the autopilot runs; it does not while it boots."""
+        autopilot = self._autopilot
+        if self._boot_ns != autopilot.up_since_ns:
+            self._boot_ns = autopilot.up_since_ns
+            self._streams = self._fresh_streams()
+            self._announced = self._status()
+        return self._t_ns() >= self._boot_ns
+
     def handle(self, link: Link, packet: Packet) -> tuple[Reply, ...]:
         """Act on what is meant for the autopilot, answer on the link it came from; returns the answers."""
         content = packet.content
-        if content is None or not self._router.for_autopilot(packet.target):
+        if content is None or not self._up() or not self._router.for_autopilot(packet.target):
             return ()
         replies: tuple[Reply, ...] = ()
         if isinstance(content, LocalSetpoint):
@@ -97,11 +114,15 @@ class Station:
         elif isinstance(content, Sticks):
             replies = self._autopilot.manual(content, self._t_ns())
         elif isinstance(content, StationHeartbeat):
-            self._autopilot.heard_station(self._t_ns())
+            self._autopilot.heard_station(self._t_ns(), content.sender.system)
         elif isinstance(content, Command):
             replies = self._command(link, content)
         elif isinstance(content, Timesync):
-            link.send(link.encoder.timesync(content, max(0, self._clock_ns() + self.clock_offset_ns)))
+            link.send(link.encoder.timesync(content, max(0, self._clock_ns() + self.clock_offset_ns - self._boot_ns)))
+        elif isinstance(content, StreamRequest):
+            for message_id in self._autopilot.stream_group(content.stream):
+                interval_us = 1e6 / content.rate_hz if content.rate_hz else -1.0
+                self._streams[link].request(message_id, interval_us, self._t_ns())
         elif isinstance(content, ParamRead):
             self._read_parameters(link, content)
         else:
@@ -123,16 +144,20 @@ class Station:
     def announce(self) -> None:
         """At once: a heartbeat at a change of mode or arming, EXTENDED_SYS_STATE at a change of landed state."""
         status = self._status()
-        if status == self._announced:
+        if not self._up() or status == self._announced:
             return
         if status[:2] != self._announced[:2]:
             self.send(HEARTBEAT)
         if status[2] != self._announced[2]:
-            self.send(EXTENDED_SYS_STATE)
+            for link in self._router.links:
+                if self._streams[link].interval_us(EXTENDED_SYS_STATE) > 0:
+                    self._send_one(link, EXTENDED_SYS_STATE, self._moment())
         self._announced = status
 
     def stream(self, *links: Link) -> None:
         """Send what is due on each of ``links``, one datagram a link."""
+        if not self._up():
+            return
         t_ns = self._t_ns()
         for link in links:
             due = self._streams[link].due(t_ns)
@@ -157,7 +182,10 @@ class Station:
 
     def _moment(self) -> Moment:
         return Moment(
-            max(0, self._t_ns() + self.clock_offset_ns), self._vehicle.state, self._autopilot, self._router.id.system
+            max(0, self._t_ns() + self.clock_offset_ns - self._boot_ns),
+            self._vehicle.state,
+            self._autopilot,
+            self._router.id.system,
         )
 
     def _status(self) -> tuple[int, bool, int]:
@@ -195,10 +223,13 @@ class Station:
         """The new value, or the unchanged one where it was refused, goes to everybody."""
         if wanted.name not in self._autopilot.parameters.names:
             return
-        self._autopilot.parameters.write(wanted.name, wanted.value, is_int=wanted.is_int)
+        parameters = self._autopilot.parameters
+        value = wanted.value if parameters.cast_to(wanted.name) is None else wanted.cast
+        parameters.write(wanted.name, value, is_int=wanted.is_int)
         for link in self._router.links:
             link.send(self._param_value(link, wanted.name))
 
     def _param_value(self, link: Link, name: str) -> bytes:
-        names = self._autopilot.parameters.names
-        return link.encoder.param(name, self._autopilot.parameters[name], names.index(name), len(names))
+        parameters = self._autopilot.parameters
+        index, count = parameters.names.index(name), len(parameters.names)
+        return link.encoder.param(name, parameters[name], index, count, cast_to=parameters.cast_to(name))

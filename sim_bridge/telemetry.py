@@ -158,6 +158,7 @@ BUILDERS: Mapping[int, Callable[[Moment], Message]] = {
     ATTITUDE_QUATERNION: attitude_quaternion,
     LOCAL_POSITION_NED: local_position_ned,  # last: it is what a companion answers
 }
+_POSITIONS = frozenset({LOCAL_POSITION_NED, GLOBAL_POSITION_INT, HOME_POSITION, GPS_GLOBAL_ORIGIN})
 ALIVE = (HEARTBEAT, EXTENDED_SYS_STATE, SYS_STATUS, HOME_POSITION)  # what a ground station needs to find us healthy
 
 
@@ -217,5 +218,7 @@ class Streams:
 
 def build(message_id: int, now: Moment, encoder: Encoder) -> bytes:
     """Bytes of one message now, none where it has nothing to tell."""
+    if message_id in _POSITIONS and not now.autopilot.position_valid:
+        return b""
     message = BUILDERS[message_id](now)
     return b"" if message is None else encoder.pack(message)

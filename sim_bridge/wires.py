@@ -47,11 +47,6 @@ class Feed:
         stamp_ns = max(0, frame[0] + self.offset_ns + clock_offset_ns)
         return Outgoing(stamp_ns, frame, encode_frame((stamp_ns, frame[1]), self.spec.sigma_m))
 
-    def again(self, first: Outgoing, now: Outgoing) -> Outgoing:
-        """The picture of ``first`` under the stamp of ``now``: a source that is stuck."""
-        frame = (now.stamp_ns, first.frame[1])
-        return Outgoing(now.stamp_ns, frame, encode_frame(frame, self.spec.sigma_m))
-
     def due(self, craft: Craft, t_ns: int, clock_offset_ns: int = 0) -> list[bytes]:
         """Payloads of what ``craft`` has measured and what leaves by ``t_ns``, after the faults."""
         frames = [self.encode(frame, clock_offset_ns) for frame in craft.frames(self.source, t_ns)]
