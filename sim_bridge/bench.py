@@ -144,6 +144,9 @@ def print_cases(cases: Sequence[Case]) -> None:
     console = Console()
     console.print(table)
     console.print(where)
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    if load > cores:
+        console.print(f"load {load:.1f} on {cores} cores: these are the scheduler's figures more than the simulator's")
 
 
 def _machine() -> dict[str, Any]:
