@@ -2,7 +2,8 @@
 
 Each step: rotor speeds follow their commands with first-order lag; every rotor pushes with k_f w^2 where it stands
 and turns the body with c k_m w^2; rotor drag F = -k (sum w) v acts in body axes, v relative to the air. The body is
-moved by these forces and by contacts alone: nothing here sets its pose or velocity once it is built.
+moved by these forces and by contacts alone: nothing here sets its pose or velocity once it is built. PyBullet is given
+their sum and its torque about the centre of mass, not each: its calls are what a step costs.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 
 import pybullet
 
-from sim_bridge.crazyflie import SPIN_TORQUE_SIGN, Crazyflie, Quad, Triple
+from sim_bridge.crazyflie import Crazyflie, Quad, Triple
 
 _RAD_S_PER_RPM = 2.0 * math.pi / 60.0
 _GROUND_CONTACT_M = 1e-3
@@ -60,6 +61,7 @@ class Body:
         self._rated_rpm = vehicle.max_rpm
         self._top_rpm = self._rated_rpm
         self._drag = rotor_drag
+        self._lever_m = vehicle.arm_m / math.sqrt(2.0)  # of a rotor, about x and about y
         # exact solution of the lag over one step with the command held
         self._lag_up = -math.expm1(-1.0 / (physics_hz * vehicle.motor_up_s))
         self._lag_down = -math.expm1(-1.0 / (physics_hz * vehicle.motor_down_s))
@@ -94,19 +96,17 @@ class Body:
 
     def push(self, rpm_command: Quad) -> None:
         """Let the rotors follow ``rpm_command`` (clipped to the motors') over one step and apply their forces."""
-        client, body = self._client, self.number
-        self.rotor_rpm = self._follow(rpm_command)
-        k_f, k_m, link_frame = self.vehicle.k_f, self.vehicle.k_m, pybullet.LINK_FRAME
-        torque_z_n_m = 0.0
-        for rpm, position_flu, sign, factor in zip(
-            self.rotor_rpm, self.rotors_flu, SPIN_TORQUE_SIGN, self.factors, strict=True
-        ):
-            squared = rpm * rpm
-            torque_z_n_m += sign * k_m * squared
-            pybullet.applyExternalForce(body, -1, (0.0, 0.0, k_f * squared * factor), position_flu, link_frame, client)
-        pybullet.applyExternalTorque(body, -1, (0.0, 0.0, torque_z_n_m), link_frame, client)
-        if self._drag:
-            pybullet.applyExternalForce(body, -1, self._drag_flu(), _ORIGIN, link_frame, client)
+        client, body, link_frame = self._client, self.number, pybullet.LINK_FRAME
+        self.rotor_rpm = w0, w1, w2, w3 = self._follow(rpm_command)
+        s0, s1, s2, s3 = w0 * w0, w1 * w1, w2 * w2, w3 * w3
+        k_f, (c0, c1, c2, c3) = self.vehicle.k_f, self.factors
+        f0, f1, f2, f3 = k_f * s0 * c0, k_f * s1 * c1, k_f * s2 * c2, k_f * s3 * c3
+        roll, pitch = self._lever_m * (f0 + f1 - f2 - f3), self._lever_m * (f1 + f2 - f0 - f3)
+        torque_flu = (roll, pitch, self.vehicle.k_m * (s1 + s3 - s0 - s2))
+        dx, dy, dz = self._drag_flu() if self._drag else _ORIGIN
+        force_flu = (dx, dy, dz + f0 + f1 + f2 + f3)
+        pybullet.applyExternalForce(body, -1, force_flu, _ORIGIN, link_frame, client)
+        pybullet.applyExternalTorque(body, -1, torque_flu, link_frame, client)
         if self.downwash_n > 0.0:
             down = (0.0, 0.0, -self.downwash_n)
             pybullet.applyExternalForce(body, -1, down, self.state.p_enu, pybullet.WORLD_FRAME, client)
@@ -132,7 +132,8 @@ class Body:
 
     def _drag_flu(self) -> Triple:
         """-k (sum of rotor speeds, rad/s) (v - wind) in body axes [N]."""
-        total = sum(self.rotor_rpm) * _RAD_S_PER_RPM
+        w0, w1, w2, w3 = self.rotor_rpm
+        total = (w0 + w1 + w2 + w3) * _RAD_S_PER_RPM
         v_enu, wind_enu = self.state.v_enu, self.wind_enu
         if wind_enu is not None:
             v_enu = (v_enu[0] - wind_enu[0], v_enu[1] - wind_enu[1], v_enu[2] - wind_enu[2])

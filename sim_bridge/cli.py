@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import IO, Any
 
+from sim_bridge import bench, render
 from sim_bridge.check import check
 from sim_bridge.errors import ScenarioError, SimError
 from sim_bridge.flight import Flight
@@ -85,6 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_scenario(show, positional=True)
     show.set_defaults(run=_show)
+    bench.add_parser(commands)
+    render.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of scenario files")
     schema.set_defaults(run=_schema)
     return parser

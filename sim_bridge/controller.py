@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from sim_bridge.crazyflie import SPIN_TORQUE_SIGN, Crazyflie, Quad, Triple
+from sim_bridge.crazyflie import Crazyflie, Quad, Triple
 from sim_bridge.physics import BodyState
 
 _LEAST_UPRIGHT = 0.5  # cosine of the tilt beyond which the vertical force is no longer kept
@@ -191,22 +191,21 @@ class Controller:
         Inverse of: sum f = collective, sum y f = tau_x, -sum x f = tau_y, sum c (k_m / k_f) f = tau_z. Where one
         motor cannot, roll and pitch come first, then the collective, then yaw.
         """
-        vehicle, least, most, lever = self.vehicle, self._least_n, self._most_n, self._lever_m
+        least, most, lever, k_f = self._least_n, self._most_n, self._lever_m, self.vehicle.k_f
         roll, pitch = torque_flu[0] / lever, torque_flu[1] / lever
-        tilting = (roll - pitch, roll + pitch, -roll + pitch, -roll - pitch)
-        span = 2.0 * max(tilting)  # the four come in pairs of opposite sign
+        t0, t1 = roll - pitch, roll + pitch  # of the left rotors; those across are their opposites
+        span = 2.0 * max(abs(t0), abs(t1))
         if span > most - least:
             shrink = (most - least) / span
-            tilting = (tilting[0] * shrink, tilting[1] * shrink, tilting[2] * shrink, tilting[3] * shrink)
+            t0, t1 = t0 * shrink, t1 * shrink
             span = most - least
         share = min(max(0.25 * collective_n, least + 0.5 * span), most - 0.5 * span)
-        yaw = torque_flu[2] * vehicle.k_f / (4.0 * vehicle.k_m)
-        for turn, sign in zip(tilting, SPIN_TORQUE_SIGN, strict=True):
-            room = most - share - turn if sign * yaw > 0.0 else share + turn - least
-            if abs(yaw) > room:
-                yaw = math.copysign(max(room, 0.0), yaw)
-        f0, f1, f2, f3 = (share + turn + sign * yaw for turn, sign in zip(tilting, SPIN_TORQUE_SIGN, strict=True))
-        k_f = vehicle.k_f
+        yaw = torque_flu[2] * k_f / (4.0 * self.vehicle.k_m)
+        # rotors 1 and 3 (turns t1, -t1) speed up for a positive yaw, 0 and 2 (t0, -t0) slow down
+        up, down = (abs(t1), abs(t0)) if yaw > 0.0 else (abs(t0), abs(t1))
+        room = max(min(most - share - up, share - down - least), 0.0)
+        yaw = min(max(yaw, -room), room)
+        f0, f1, f2, f3 = share + t0 - yaw, share + t1 + yaw, share - t0 - yaw, share - t1 + yaw
         return (math.sqrt(f0 / k_f), math.sqrt(f1 / k_f), math.sqrt(f2 / k_f), math.sqrt(f3 / k_f))
 
 

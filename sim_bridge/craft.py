@@ -191,6 +191,9 @@ class Craft:
             "mode": self.autopilot.mode_name,
             "position": self.truth.p_enu,
             "velocity": self.truth.v_enu,
+            "attitude": self.truth.q_wxyz,
+            "radius_m": self._world.vehicles[self._index].radius_m,
+            "target": self.target_enu,
             "clearance_m": self.clearance_m if self._ids else None,
         }
 

@@ -145,7 +145,15 @@ class Flight:
         """Truth at this instant, for pictures; of each vehicle under ``vehicles`` where there are several."""
         first = self.crafts[0].trace()
         clearance_m = first.pop("clearance_m")
-        line = {"t_ns": self.t_ns, **first, "obstacles": self.world.obstacles_enu, "clearance_m": clearance_m}
+        line = {
+            "t_ns": self.t_ns,
+            "name": self.crafts[0].name,
+            **first,
+            "obstacles": self.world.obstacles_enu,
+            "obstacle_ids": [obstacle.id for obstacle in self.resolved.obstacles],
+            "obstacle_radii_m": self.world.radii_m,
+            "clearance_m": clearance_m,
+        }
         if len(self.crafts) > 1:
             line["vehicles"] = [{"name": craft.name, **craft.trace()} for craft in self.crafts]
         return line

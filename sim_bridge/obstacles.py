@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 Point = tuple[float, float, float]
@@ -154,9 +155,14 @@ class Timed:
         return self.motion.velocity(t_s) if self.start_s <= t_s < self.end_s else (0.0, 0.0, 0.0)
 
 
+@lru_cache(maxsize=1024)
+def _turns(axis_yaw_rad: float, tilt_rad: float) -> tuple[float, float, float, float]:
+    return math.cos(axis_yaw_rad), math.sin(axis_yaw_rad), math.cos(tilt_rad), math.sin(tilt_rad)
+
+
 def _in_plane(origin: Point, along_e1: float, along_e2: float, axis_yaw_rad: float, tilt_rad: float) -> Point:
     """origin + along_e1 e1 + along_e2 e2."""
-    cos_yaw, sin_yaw = math.cos(axis_yaw_rad), math.sin(axis_yaw_rad)
-    level, up = along_e2 * math.cos(tilt_rad), along_e2 * math.sin(tilt_rad)
+    cos_yaw, sin_yaw, cos_tilt, sin_tilt = _turns(axis_yaw_rad, tilt_rad)
+    level, up = along_e2 * cos_tilt, along_e2 * sin_tilt
     x, y, z = origin
     return (x + along_e1 * cos_yaw - level * sin_yaw, y + along_e1 * sin_yaw + level * cos_yaw, z + up)

@@ -5,6 +5,7 @@ motions say, and the batteries discharge (`battery`).
 
 Contacts follow clearance: when PyBullet looks for contacts, spheres and vehicles stand where clearance was last taken,
 and it makes a contact of two spheres only from zero distance on. So no push can keep a collision from being seen.
+A sphere that is farther from every vehicle than `_CONTACT_M` cannot touch one: it waits out of PyBullet's sight.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from sim_bridge.battery import Battery
 from sim_bridge.body import Body, BodyState, Start, to_body
 from sim_bridge.crazyflie import Crazyflie, Quad, Triple
 from sim_bridge.errors import ScenarioError
-from sim_bridge.obstacles import Motion, Point
+from sim_bridge.obstacles import AWAY_ENU, Motion, Point
 from sim_bridge.pursuit import Reacting
 from sim_bridge.scenario_world import Physics
 
 __all__ = ["BodyState", "Start", "World", "control_steps", "to_body"]
 
 _LEVEL_XYZW = (0.0, 0.0, 0.0, 1.0)
+_CONTACT_M = 0.1  # PyBullet keeps contacts up to 0.02 m apart
 _BATTERY_HZ = 20  # at which batteries discharge where they do not act on the flight
 
 
@@ -86,6 +88,7 @@ class World:
         for motion in self._reacting:
             motion.reset()
         self.radii_m = tuple(float(radius_m) for radius_m in radii_m)
+        self._reach_m = [max(v.radius_m for v in vehicles) + radius_m + _CONTACT_M for radius_m in self.radii_m]
         self.physics_hz = physics_hz
         self.step_count = 0
         self.batteries = tuple(Battery(effects.battery_start) for _ in vehicles)
@@ -97,6 +100,7 @@ class World:
         self._air = Air(effects, self.bodies, physics_hz=physics_hz, rngs=rngs)
         self.states: tuple[BodyState, ...] = tuple(body.state for body in self.bodies)
         self.obstacles_enu = self.obstacle_positions(0.0)  # true centres at this step [m]
+        self._near = [True] * len(self.motions)  # whether a sphere stands where its obstacle is
         self.clearances_m = self._clearances()  # surface to surface, of each vehicle from all else but the ground [m]
         self.min_clearances_m = list(self.clearances_m)
         self.touched_ground = [body.on_ground for body in self.bodies]
@@ -154,11 +158,13 @@ class World:
         if self._motions_from_step is not None:
             for motion in self._reacting:
                 motion.advance(1.0 / self.physics_hz, self.states)  # as they were when the step began
-            self._move_obstacles()
+            self.obstacles_enu = self.obstacle_positions(self.t_s)
         if self.step_count % self._battery_steps == 0:
             self._discharge()
         self.states = tuple([body.read() for body in self.bodies])
         self.clearances_m = self._clearances()
+        if self._motions_from_step is not None:
+            self._place_spheres()
         for index, clearance_m in enumerate(self.clearances_m):
             if clearance_m < self.min_clearances_m[index]:
                 self.min_clearances_m[index] = clearance_m
@@ -202,10 +208,20 @@ class World:
         motion_t_s = self.motion_time_s(t_s)
         return [motion.velocity(motion_t_s) for motion in self.motions]
 
-    def _move_obstacles(self) -> None:
-        self.obstacles_enu = self.obstacle_positions(self.t_s)
-        for sphere, p_enu in zip(self._spheres, self.obstacles_enu, strict=True):
-            pybullet.resetBasePositionAndOrientation(sphere, p_enu, _LEVEL_XYZW, self._client)
+    def _place_spheres(self) -> None:
+        """The spheres that could touch a vehicle where their obstacles are, the others away."""
+        reach_m = self._reach_m
+        for index, p_enu in enumerate(self.obstacles_enu):
+            near = False
+            for state in self.states:
+                if math.dist(state.p_enu, p_enu) < reach_m[index]:
+                    near = True
+            if near or self._near[index]:
+                self._near[index] = near
+                self._place_sphere(index, p_enu if near else AWAY_ENU)
+
+    def _place_sphere(self, index: int, p_enu: Point) -> None:
+        pybullet.resetBasePositionAndOrientation(self._spheres[index], p_enu, _LEVEL_XYZW, self._client)
 
     def _clearances(self) -> tuple[float, ...]:
         """min over obstacles and other vehicles of |p - p_o| - r_d - r_o [m]; inf where there is nothing else."""
@@ -233,6 +249,8 @@ class World:
     def closest_points_m(self, index: int, vehicle: int = 0) -> float:
         """Distance from a vehicle to obstacle ``index`` as PyBullet's own narrow phase finds it [m]."""
         body = self.bodies[vehicle].number
+        self._near[index] = True
+        self._place_sphere(index, self.obstacles_enu[index])
         points = pybullet.getClosestPoints(body, self._spheres[index], 1e3, physicsClientId=self._client)
         return float(min(point[8] for point in points))
 

@@ -137,12 +137,8 @@ class Sensor:
         self._clutter_rng = rng.spawn(1)[0] if self._clutter.mean > 0.0 else None
         self._clutter_count = 0
         self._tick = 0  # index of the next measurement on the grid
+        self.next_ns = 0  # its time
         self._in_transit: deque[Frame] = deque()
-
-    @property
-    def next_ns(self) -> int:
-        """Time of the next measurement."""
-        return int(self._tick * NS_PER_S // self._rate_hz)
 
     def sample(self, t_ns: int, positions: Sequence[Point], observer: Observer | None = None) -> None:
         """Measure at ``t_ns`` if a measurement is due by then, else do nothing. The frame is stamped ``t_ns``.
@@ -154,6 +150,7 @@ class Sensor:
             return
         while self.next_ns <= t_ns:
             self._tick += 1
+            self.next_ns = int(self._tick * NS_PER_S // self._rate_hz)
         frame_lost = self._rng.random() < self._frame_dropout
         lost = self._rng.random(len(self._named)) < self._dropout
         noise = self._sigma_m * self._rng.standard_normal((len(self._named), 3))

@@ -50,6 +50,7 @@ class Record(msgspec.Struct, frozen=True):
     messages: int = 0
     state: str = ""
     verdict: str = ""
+    timings_ms: dict[str, float] = {}
 
 
 _ENCODER = msgspec.json.Encoder()

@@ -38,6 +38,7 @@ HAS_BLOCK.flags.writeable = False
 
 TURN_LIMIT_RAD_S = 10.0  # no obstacle of interest turns faster; keeps an absurd fix from winding CT up
 _SERIES_BELOW_RAD = 3e-4
+FEW = 4  # different times between tracks and an instant that are worth looking up one by one
 _TINY = float(np.finfo(np.float64).tiny)
 _ORDER = 5  # highest power of dt in F and Q
 _EXPONENTS = np.arange(_ORDER + 1.0)
@@ -155,7 +156,7 @@ def propagate(
         new (x, covariance), same shapes.
     """
     count = x.shape[0]
-    step = _shared_step(models, shared_s) if (shared_s := shared(dt)) is not None else _steps(models, dt)
+    step = _step(models, dt)
     jacobian = np.empty((count, MODELS, SIZE, SIZE))
     jacobian[:] = step.transition
     rotation, integral, slope = turn_terms(x[:, CT, TURN], dt)
@@ -181,9 +182,27 @@ def shared(dt: FloatArray) -> float | None:
     return values[0] if values and values.count(values[0]) == len(values) else None
 
 
+def _step(models: MotionModels, dt: FloatArray) -> Step:
+    """Of every track, its rows equal to the bit whichever way they are made.
+
+    Steady flight asks for the same few dt again and again: of one for all, or, where some were missed, of a few.
+    """
+    values: list[float] = dt.tolist()
+    different = set(values)
+    if len(different) == 1:
+        return _shared_step(models, values[0])
+    if not 0 < len(different) <= FEW:
+        return _steps(models, dt)
+    steps = [_shared_step(models, dt_s) for dt_s in values]
+    return Step(
+        np.concatenate([step.transition for step in steps]),
+        np.concatenate([step.noise for step in steps]),
+        np.concatenate([step.turn_noise for step in steps]),
+    )
+
+
 @lru_cache(maxsize=64)
 def _shared_step(models: MotionModels, dt_s: float) -> Step:
-    """Steady flight asks for the same few dt again and again."""
     return _steps(models, np.array([dt_s]))
 
 

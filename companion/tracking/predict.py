@@ -107,6 +107,16 @@ def horizon(tau_s: FloatArray, models: MotionModels) -> Horizon:
     return Horizon(tau_s, np.stack((np.ones_like(tau_s), tau_s, phi), axis=1), noise, 0.2 * models.turn_psd * ahead_s)
 
 
+def joined(horizons: list[Horizon]) -> Horizon:
+    """One horizon a track, as `horizon` of all their instants would be, to the bit."""
+    return Horizon(
+        np.concatenate([each.tau_s for each in horizons]),
+        np.concatenate([each.reach for each in horizons]),
+        np.concatenate([each.noise for each in horizons]),
+        np.concatenate([each.turn_noise for each in horizons]),
+    )
+
+
 def predict_positions(
     x: FloatArray, covariance: FloatArray, probabilities: FloatArray, at: Horizon
 ) -> tuple[FloatArray, FloatArray]:

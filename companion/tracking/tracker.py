@@ -21,10 +21,10 @@ from companion.tracking.cycle import Rules, consume
 from companion.tracking.engine import make_engine
 from companion.tracking.imm import fuse, widened
 from companion.tracking.lifecycle import forget
-from companion.tracking.models import shared
+from companion.tracking.models import FEW
 from companion.tracking.ownship import OwnPath
 from companion.tracking.picture import Picture, empty_picture, source_names, statuses
-from companion.tracking.predict import Horizon, horizon, largest_sigma, velocity_ahead
+from companion.tracking.predict import Horizon, horizon, joined, largest_sigma, velocity_ahead
 from companion.tracking.replay import Replay
 from companion.tracking.tracks import BoolArray, Rows, Tracks
 from companion.types import NS_PER_S, DetectionFrame, FloatArray, Prediction, TrackTable, VehicleState
@@ -153,16 +153,21 @@ class Tracker:
         return p_enu, widened(spread, bank, self._constants)
 
     def _grid(self, since_s: FloatArray, steps: int, dt_s: float) -> Horizon:
-        """The instants of a prediction; where all tracks share them they are kept, as in steady flight."""
-        first_s = shared(since_s)
-        grid = np.arange(float(steps)) * dt_s
-        if first_s is None:
-            return horizon(since_s[:, None] + grid, self._constants.models)
+        """The instants of a prediction; where tracks share them they are kept, as in steady flight."""
+        starts: list[float] = since_s.tolist()
+        different = set(starts)
+        if len(different) == 1:
+            return self._kept_horizon(starts[0], steps, dt_s)
+        if not 0 < len(different) <= FEW:
+            return horizon(since_s[:, None] + np.arange(float(steps)) * dt_s, self._constants.models)
+        return joined([self._kept_horizon(first_s, steps, dt_s) for first_s in starts])
+
+    def _kept_horizon(self, first_s: float, steps: int, dt_s: float) -> Horizon:
         key = (first_s, steps, dt_s)
         if key not in self._horizons:
             if len(self._horizons) >= HORIZONS:
                 self._horizons.clear()
-            self._horizons[key] = horizon(first_s + grid, self._constants.models)
+            self._horizons[key] = horizon(first_s + np.arange(float(steps)) * dt_s, self._constants.models)
         return self._horizons[key]
 
     def _visible(self) -> BoolArray:
