@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
+from sim_bridge.ardupilot_arming import arming_reasons
 from sim_bridge.ardupilot_copter import PILOTED, Copter
 from sim_bridge.ardupilot_failsafe import LANDING_CONTINUES, PILOT_CONTINUES, Action, Event, Failsafes
 from sim_bridge.ardupilot_guided import Submode
@@ -51,7 +52,6 @@ _STREAMS: Mapping[int, tuple[int, ...]] = {  # MAV_DATA_STREAM
     11: (74,),
     12: (147,),
 }
-_ARMABLE = (*PILOTED, ArduMode.GUIDED)
 _NEED_POSITION = (ArduMode.LOITER, ArduMode.RTL, ArduMode.BRAKE)
 _ACTIONS = {Action.RTL: ArduMode.RTL, Action.LAND: ArduMode.LAND, Action.BRAKE: ArduMode.BRAKE}
 
@@ -86,6 +86,7 @@ class ArduCopter:
         self._ekf_told = self._born_airborne
         self._prearm_told_ns = 0
         self._nan_told_ns: int | None = None
+        self._attitude_told = False
         self._handlers: dict[int, Callable[[Command], tuple[Result, str]]] = {
             Cmd.COMPONENT_ARM_DISARM: self._arm_disarm,
             Cmd.NAV_TAKEOFF: self._takeoff,
@@ -196,7 +197,9 @@ class ArduCopter:
         return (Text(Severity.CRITICAL, "NaN in setpoint: ArduCopter would crash"),)
 
     def attitude_setpoint(self, setpoint: AttitudeTarget, t_ns: int) -> tuple[Reply, ...]:
-        return ()
+        """GUIDED's attitude control is left out, and says so once."""
+        told, self._attitude_told = self._attitude_told, True
+        return () if told else (Text(Severity.WARNING, "SET_ATTITUDE_TARGET is not simulated"),)
 
     def manual(self, sticks: Sticks, t_ns: int) -> tuple[Reply, ...]:
         """The sticks of the ground station that SYSID_MYGCS names; they fly the piloted modes."""
@@ -260,18 +263,7 @@ class ArduCopter:
         return Result.ACCEPTED, ""
 
     def _arming_reasons(self) -> list[str]:
-        """Why it cannot be armed now, in the order in which ArduCopter looks."""
-        reasons = []
-        if self.parameters["ARMING_CHECK"]:
-            reasons += [f"PreArm: {reason}" for reason in self._failsafes.battery_reasons()]
-        needs_position = self.mode in (ArduMode.LOITER, ArduMode.GUIDED) or bool(self.parameters["FENCE_ENABLE"])
-        if needs_position and not self.position_valid:
-            reasons.append("PreArm: Need Position Estimate")
-        outside = self._failsafes.outside(self._copter.state.p_enu, self.home_enu)
-        reasons += [f"PreArm: Vehicle breaching {name} fence" for name in outside]
-        if self.mode not in _ARMABLE:
-            reasons.append(f"Arm: {self.mode.name} mode not armable")
-        return reasons
+        return arming_reasons(self._copter, self._failsafes, self.parameters, position_valid=self.position_valid)
 
     def _takeoff(self, command: Command) -> tuple[Result, str]:
         above_m = command.params[6]

@@ -22,7 +22,7 @@ class Definition:
 
 DEFINITIONS: dict[str, Definition] = {
     "ANGLE_MAX": Definition(3000, INT16),  # lean angle [0.01 deg]
-    "ARMING_CHECK": Definition(1, INT32),  # 0: position, mode and battery are not looked at
+    "ARMING_CHECK": Definition(1, INT32),  # 0: the battery is not looked at before arming
     "BATT_ARM_MAH": Definition(0, INT32),  # least that is left for arming [mAh]
     "BATT_CAPACITY": Definition(250, INT32),  # [mAh]; the Crazyflie's, ArduPilot's default is 3300
     "BATT_CRT_MAH": Definition(0.0, REAL32),  # critical when no more is left [mAh], 0: never
