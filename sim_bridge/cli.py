@@ -19,6 +19,7 @@ from sim_bridge.messages import NS_PER_S
 from sim_bridge.placement import Resolved, describe, resolve
 from sim_bridge.runner import RealTime, Trace, Wires
 from sim_bridge.scenario import load_scenario
+from sim_bridge.scenario_schema import scenario_schema
 
 DONE, FAILED, USAGE = 0, 1, 2
 _NO_ZENOH = "none"
@@ -68,6 +69,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_scenario(show, positional=True)
     show.set_defaults(run=_show)
+    schema = commands.add_parser("schema", help="print the JSON Schema of scenario files")
+    schema.set_defaults(run=_schema)
     return parser
 
 
@@ -102,6 +105,11 @@ def _resolved(arguments: argparse.Namespace) -> Resolved:
 def _show(arguments: argparse.Namespace) -> int:
     described = describe(_resolved(arguments), arguments.name)
     print(json.dumps(described, indent=None if arguments.json else 2))
+    return DONE
+
+
+def _schema(arguments: argparse.Namespace) -> int:
+    print(json.dumps(scenario_schema(), indent=2))
     return DONE
 
 

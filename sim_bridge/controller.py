@@ -76,23 +76,38 @@ class Gains:
     rate_max_rad_s: float = 10.0
     least_collective: float = 0.35  # of the weight, so that tilt stays in command while sinking
     most_collective: float = 1.9  # of the weight: the rest is for torques
+    integral_hz2: float = 0.0  # [1/s^2] integral of the velocity error -> acceleration; 0 off
+    integral_max_m_s2: float = 5.0
 
 
 class Controller:
     """Rotor speeds that follow a setpoint; call `rpm` once a physics step.
 
-    The one hidden state is the body rate of the last step (for its derivative); ``reset`` forgets it.
+    The hidden state is the body rate of the last step (for its derivative) and, where it is on, the integral of the
+    velocity error; ``reset`` forgets both. The integral, like PX4's, rests while acceleration setpoints are flown.
+
+    Args:
+        hover_thrust_error: share by which it misjudges its thrust: asked for f it gives (1 + error) f.
     """
 
-    def __init__(self, vehicle: Crazyflie, physics_hz: int, gains: Gains | None = None) -> None:
+    def __init__(
+        self, vehicle: Crazyflie, physics_hz: int, gains: Gains | None = None, *, hover_thrust_error: float = 0.0
+    ) -> None:
         self.vehicle = vehicle
         self.gains = Gains() if gains is None else gains
         self._rate_hz = float(physics_hz)
         self._tilt_tan = math.tan(self.gains.tilt_max_rad)
+        # the vehicle's derived figures, once: these loops run every physics step
+        self._weight_n = vehicle.weight_n
+        self._least_n, self._most_n = vehicle.idle_thrust_n, vehicle.k_f * vehicle.max_rpm**2
+        self._lever_m = 4.0 * vehicle.arm_m / math.sqrt(2.0)
+        self._thrust_scale = 1.0 + hover_thrust_error
         self._last_omega: Triple | None = None
+        self._integral: Triple = (0.0, 0.0, 0.0)
 
     def reset(self) -> None:
         self._last_omega = None
+        self._integral = (0.0, 0.0, 0.0)
 
     def rpm(self, state: BodyState, setpoint: Setpoint) -> Quad:
         """Rotor speed commands, front left, rear left, rear right, front right [RPM]."""
@@ -110,7 +125,7 @@ class Controller:
         # the vertical force is kept exact while the body turns: sideways steps do not lift or drop the vehicle
         collective_n = fz / max(upright, _LEAST_UPRIGHT) if upright > 0.0 else 0.0
         torque = self._torque(state, self._wanted_rates(state.q_wxyz, (fx, fy, fz), setpoint.yaw_rad))
-        return self.mix(collective_n, torque)
+        return self.mix(self._thrust_scale * collective_n, torque)
 
     def _follow_attitude(self, state: BodyState, setpoint: AttitudeSetpoint) -> Quad:
         wanted = setpoint.omega_flu
@@ -137,14 +152,24 @@ class Controller:
         else:
             raise TypeError(f"setpoint: expected one of {Setpoint}, got {setpoint!r}")
         k, (vx, vy, vz), (wx, wy, wz) = gains.velocity_hz, state.v_enu, wanted
-        return _shortened((k * (wx - vx), k * (wy - vy), k * (wz - vz)), gains.a_max_m_s2)
+        a_enu = _shortened((k * (wx - vx), k * (wy - vy), k * (wz - vz)), gains.a_max_m_s2)
+        return a_enu if gains.integral_hz2 == 0.0 else self._integrated(a_enu)
+
+    def _integrated(self, a_enu: Triple) -> Triple:
+        """``a_enu`` plus the integral of the velocity error, which stands still while ``a_enu`` is at its limit."""
+        gains, (ix, iy, iz) = self.gains, self._integral
+        if math.hypot(*a_enu) < gains.a_max_m_s2 * 0.999:
+            k = gains.integral_hz2 / gains.velocity_hz / self._rate_hz
+            grown = (ix + k * a_enu[0], iy + k * a_enu[1], iz + k * a_enu[2])
+            ix, iy, iz = self._integral = _shortened(grown, gains.integral_max_m_s2)
+        return (a_enu[0] + ix, a_enu[1] + iy, a_enu[2] + iz)
 
     def _thrust_vector(self, a_enu: Triple, tilt_tan: float) -> Triple:
         """m (a + g e3), its vertical part within the collective's range, its horizontal part within the tilt limit."""
-        vehicle, gains = self.vehicle, self.gains
-        fx, fy, fz = vehicle.mass_kg * a_enu[0], vehicle.mass_kg * a_enu[1], vehicle.mass_kg * a_enu[2]
-        fz += vehicle.weight_n
-        fz = min(max(fz, gains.least_collective * vehicle.weight_n), gains.most_collective * vehicle.weight_n)
+        mass_kg, weight_n, gains = self.vehicle.mass_kg, self._weight_n, self.gains
+        fx, fy, fz = mass_kg * a_enu[0], mass_kg * a_enu[1], mass_kg * a_enu[2]
+        fz += weight_n
+        fz = min(max(fz, gains.least_collective * weight_n), gains.most_collective * weight_n)
         level, level_max = math.hypot(fx, fy), fz * tilt_tan
         if level > level_max:
             fx, fy = fx * level_max / level, fy * level_max / level
@@ -193,9 +218,7 @@ class Controller:
         Inverse of: sum f = collective, sum y f = tau_x, -sum x f = tau_y, sum c (k_m / k_f) f = tau_z. Where one
         motor cannot, roll and pitch come first, then the collective, then yaw.
         """
-        vehicle = self.vehicle
-        least, most = vehicle.idle_thrust_n, vehicle.k_f * vehicle.max_rpm**2
-        lever = 4.0 * vehicle.arm_m / math.sqrt(2.0)
+        vehicle, least, most, lever = self.vehicle, self._least_n, self._most_n, self._lever_m
         roll, pitch = torque_flu[0] / lever, torque_flu[1] / lever
         tilting = (roll - pitch, roll + pitch, -roll + pitch, -roll - pitch)
         span = 2.0 * max(tilting)  # the four come in pairs of opposite sign
@@ -207,7 +230,8 @@ class Controller:
         yaw = torque_flu[2] * vehicle.k_f / (4.0 * vehicle.k_m)
         for turn, sign in zip(tilting, SPIN_TORQUE_SIGN, strict=True):
             room = most - share - turn if sign * yaw > 0.0 else share + turn - least
-            yaw = math.copysign(min(abs(yaw), max(room, 0.0)), yaw)
+            if abs(yaw) > room:
+                yaw = math.copysign(max(room, 0.0), yaw)
         f0, f1, f2, f3 = (share + turn + sign * yaw for turn, sign in zip(tilting, SPIN_TORQUE_SIGN, strict=True))
         k_f = vehicle.k_f
         return (math.sqrt(f0 / k_f), math.sqrt(f1 / k_f), math.sqrt(f2 / k_f), math.sqrt(f3 / k_f))

@@ -1,4 +1,4 @@
-"""The vehicle in its world: physics, controller, autopilot, sensors and judge, advanced one physics step at a time."""
+"""The vehicles of a scenario in their world, advanced one physics step at a time; no wires."""
 
 from __future__ import annotations
 
@@ -7,70 +7,94 @@ from typing import Any
 import msgspec
 
 from sim_bridge.autopilot import Autopilot
-from sim_bridge.controller import Controller
+from sim_bridge.controller import Controller, Gains
+from sim_bridge.craft import Craft
 from sim_bridge.crazyflie import Crazyflie
-from sim_bridge.judge import Judge
+from sim_bridge.errors import ScenarioError
+from sim_bridge.estimator import Estimator
 from sim_bridge.messages import NS_PER_S, Reply
 from sim_bridge.personality import Personality
-from sim_bridge.physics import BodyState, World
+from sim_bridge.physics import Start, World
 from sim_bridge.placement import Resolved
-from sim_bridge.sensors import Frame, Sensor
+from sim_bridge.scenario import Scenario, Vehicle
+from sim_bridge.scenario_world import EstimatorNoise, Imu, Physics
+from sim_bridge.sensors import Sensor
 
-_NEAR_M = 1.0  # closer than this, each obstacle's approach is looked at in every physics step, else in every period
+_GUSTS, _ESTIMATOR = 0, 1  # effects that draw
+_INTEGRAL_HZ2 = 2.0  # PX4's MPC_Z_VEL_I_ACC
 
 
 class Flight:
-    """One vehicle, one scenario, no wires. Time is the count of physics steps."""
+    """One scenario, all its vehicles. Time is the count of physics steps.
 
-    def __init__(self, resolved: Resolved, vehicle: Crazyflie | None = None) -> None:
-        vehicle = Crazyflie() if vehicle is None else vehicle
-        scenario = resolved.scenario
-        yaw_rad = scenario.vehicle.yaw_rad
-        radii_m = [o.radius_m for o in resolved.obstacles]
+    Args:
+        model: the physical parameters, the same for every vehicle.
+    """
+
+    def __init__(self, resolved: Resolved, model: Crazyflie | None = None) -> None:
+        model = Crazyflie() if model is None else model
+        scenario, fleet = resolved.scenario, resolved.scenario.fleet
         self.resolved = resolved
         self.world = World(
-            vehicle,
+            [model] * len(fleet),
             [o.motion for o in resolved.obstacles],
-            radii_m=radii_m,
+            radii_m=[o.radius_m for o in resolved.obstacles],
             physics_hz=scenario.physics_hz,
-            start_enu=scenario.vehicle.start,
-            start_yaw_rad=yaw_rad,
+            starts=[Start(spec.start, spec.yaw_rad) for spec in fleet],
+            effects=scenario.physics,
+            rngs=[resolved.physics_rng(_GUSTS, index) for index in range(len(fleet))],
         )
-        self.autopilot: Personality = Autopilot(
-            start_enu=scenario.vehicle.start,
-            rest_height_m=vehicle.radius_m,
-            yaw_rad=yaw_rad,
-            control_hz=scenario.control_hz,
-            physics_hz=scenario.physics_hz,
+        self.crafts = tuple(self._craft(index, spec) for index, spec in enumerate(fleet))
+        self._started_ns: int | None = None
+        for craft in self.crafts:
+            craft.sense()
+
+    def _craft(self, index: int, spec: Vehicle) -> Craft:
+        scenario, world = self.resolved.scenario, self.world
+        model, physics = world.vehicles[index], scenario.physics
+        others = [(other.name, world.vehicles[i].radius_m) for i, other in enumerate(scenario.fleet) if i != index]
+        ids = [o.id for o in self.resolved.obstacles]
+        estimator = None
+        if physics.estimator != EstimatorNoise() or physics.imu != Imu():
+            rng = self.resolved.physics_rng(_ESTIMATOR, index)
+            estimator = Estimator(physics.estimator, physics.imu, physics_hz=scenario.physics_hz, rng=rng)
+        gains = Gains(integral_hz2=_INTEGRAL_HZ2) if _disturbed(scenario) else Gains()
+        return Craft(
+            world,
+            index,
+            name=spec.name,
+            system_id=spec.system_id,
+            autopilot=_autopilot(scenario, spec, model),
+            controller=Controller(model, scenario.physics_hz, gains, hover_thrust_error=physics.hover_thrust_error),
+            estimator=estimator,
+            sensors=self._sensors(
+                index, [*ids, *(name for name, _ in others)], [*world.radii_m, *(radius for _, radius in others)]
+            ),
+            obstacle_ids=ids,
+            others=others,
+            end=scenario.end,
+            target_enu=scenario.target_of(spec),
         )
-        self.autopilot.parameters.write("MIS_TAKEOFF_ALT", scenario.vehicle.takeoff_altitude_m, is_int=False)
-        self.judge: Judge | None = None
-        self._controller = Controller(vehicle, scenario.physics_hz)
-        self._ids = [o.id for o in resolved.obstacles]
-        self._radii_m = radii_m
-        self._sensors = {
+
+    def _sensors(self, vehicle: int, ids: list[str], radii_m: list[float]) -> dict[str, Sensor]:
+        scenario = self.resolved.scenario
+        return {
             spec.source: Sensor(
-                self._ids,
+                ids,
                 radii_m,
                 rate_hz=spec.rate_hz,
                 sigma_m=spec.sigma_m,
                 latency_s=spec.latency_s,
                 dropout=spec.dropout,
                 frame_dropout=spec.frame_dropout,
-                rng=resolved.sensor_rng(index),
+                rng=self.resolved.sensor_rng(index, vehicle),
             )
-            for index, spec in enumerate(scenario.sensors)
+            for index, spec in scenario.carried(scenario.fleet[vehicle].name)
         }
-        self._dt_s = 1.0 / scenario.physics_hz
-        self._sense()
 
     @property
     def t_ns(self) -> int:
-        return self.world.step_count * NS_PER_S // self.world.physics_hz
-
-    @property
-    def state(self) -> BodyState:
-        return self.world.state
+        return self.world.t_ns
 
     @property
     def at_tick(self) -> bool:
@@ -78,84 +102,89 @@ class Flight:
         return self.world.step_count % self.resolved.control_steps == 0
 
     def advance(self) -> None:
-        """One physics step under the autopilot's present target; the obstacles start with external control."""
-        world, autopilot = self.world, self.autopilot
-        if self.judge is None and autopilot.external and autopilot.armed:
-            self._start()
-        world.step(self._controller.rpm(world.state, autopilot.target(world.state)))
-        autopilot.turn(self._dt_s)
-        self._sense()
-        if self.judge is not None:
-            grounded = world.on_ground and autopilot.external
-            self.judge.step(self.t_ns, world.state.p_enu, world.clearance_m, grounded=grounded)
-            if world.clearance_m < _NEAR_M or self.at_tick:
-                self.judge.approach(self.t_ns, world.state.p_enu, world.obstacles_enu)
+        """One physics step of every vehicle; the obstacles start with the first that is flown from outside."""
+        for craft in self.crafts:
+            if craft.judge is None and craft.external:
+                self._begin(craft)
+        self.world.step([craft.command() for craft in self.crafts])
+        t_ns, at_tick = self.world.t_ns, self.at_tick
+        for craft in self.crafts:
+            craft.follow(t_ns, at_tick=at_tick)
 
-    def control(self) -> tuple[Reply, ...]:
-        """The autopilot's look at the clock, once a control period."""
-        return self.autopilot.step(self.world.state, self.t_ns)
+    def _begin(self, craft: Craft) -> None:
+        if self._started_ns is None:
+            self._started_ns = self.t_ns
+            self.world.start_motions()
+        craft.begin()
 
-    def frames(self, source: str, t_ns: int) -> list[Frame]:
-        """Frames of a sensor that have arrived by ``t_ns``."""
-        return self._sensors[source].due(t_ns)
+    def control(self) -> tuple[tuple[Reply, ...], ...]:
+        """Each autopilot's look at the clock, once a control period."""
+        return tuple(craft.control() for craft in self.crafts)
 
     @property
     def ended(self) -> str | None:
-        """Why the flight is over: reached, collision, timeout; None while it goes on."""
-        return None if self.judge is None else self.judge.verdict(self.t_ns)
+        """Why the flight is over, None while it goes on: the worst of its vehicles' (collision, timeout, reached).
+
+        A vehicle with a target that nobody has taken over yet is waited for until ``timeout_s`` after the first was.
+        """
+        if self._started_ns is None:
+            return None
+        over = self.t_ns - self._started_ns >= self.resolved.scenario.end.timeout_s * NS_PER_S
+        ends = set()
+        for craft in self.crafts:
+            end = craft.ended
+            if end is None and craft.judge is None:
+                end = "timeout" if over else ("reached" if craft.target_enu is None else None)
+            if end is None:
+                return None
+            ends.add(end)
+        return next(end for end in ("collision", "timeout", "reached") if end in ends)
 
     def summary(self) -> dict[str, Any]:
-        """The outcome, as far as it has come."""
-        judge = self.judge
-        if judge is None:
-            return {
-                "reached": False,
-                "collided": False,
-                "min_clearance_m": None,
-                "flight_time_s": None,
-                "approaches": [],
-            }
-        return {
-            "reached": judge.reached_ns is not None,
-            "collided": judge.collided_ns is not None,
-            "min_clearance_m": judge.min_clearance_m if self._ids else None,
-            "flight_time_s": judge.flight_time_s,
-            "approaches": [msgspec.to_builtins(a) for a in judge.approaches if a is not None],
-        }
+        """The outcome of the first vehicle, as far as it has come; of each under ``vehicles`` where there are more."""
+        first = self.crafts[0].summary()
+        if len(self.crafts) == 1:
+            return first
+        return {**first, "vehicles": [{"name": c.name, "ended": c.ended, **c.summary()} for c in self.crafts]}
 
     def trace_line(self) -> dict[str, Any]:
-        """Truth at this instant, for pictures."""
-        world = self.world
-        judge = self.judge
-        return {
-            "t_ns": self.t_ns,
-            "offboard_s": None if judge is None else (self.t_ns - judge.start_ns) / NS_PER_S,
-            "mode": self.autopilot.mode_name,
-            "position": world.state.p_enu,
-            "velocity": world.state.v_enu,
-            "obstacles": world.obstacles_enu,
-            "clearance_m": world.clearance_m if self._ids else None,
-        }
+        """Truth at this instant, for pictures; of each vehicle under ``vehicles`` where there are several."""
+        first = self.crafts[0].trace()
+        clearance_m = first.pop("clearance_m")
+        line = {"t_ns": self.t_ns, **first, "obstacles": self.world.obstacles_enu, "clearance_m": clearance_m}
+        if len(self.crafts) > 1:
+            line["vehicles"] = [{"name": craft.name, **craft.trace()} for craft in self.crafts]
+        return line
 
     def close(self) -> None:
         self.world.close()
 
-    def _start(self) -> None:
-        target = self.resolved.scenario.target
-        self.world.start_motions()
-        self.world.reset_min_clearance()
-        self.judge = Judge(
-            self.resolved.scenario.end,
-            None if target is None else target.position,
-            start_ns=self.t_ns,
-            p_enu=self.world.state.p_enu,
-            radius_m=self.world.vehicle.radius_m,
-            ids=self._ids,
-            radii_m=self._radii_m,
-        )
 
-    def _sense(self) -> None:
-        t_ns = self.t_ns
-        for sensor in self._sensors.values():
-            if t_ns >= sensor.next_ns:
-                sensor.sample(t_ns, self.world.obstacles_enu)
+def _autopilot(scenario: Scenario, spec: Vehicle, model: Crazyflie) -> Personality:
+    """The autopilot of one vehicle, with the parameters of its table."""
+    if spec.personality != "px4":
+        raise ScenarioError(f"{spec.name}: personality: expected px4, got {spec.personality}")
+    autopilot = Autopilot(
+        start_enu=spec.start,
+        rest_height_m=model.radius_m,
+        yaw_rad=spec.yaw_rad,
+        control_hz=scenario.control_hz,
+        physics_hz=scenario.physics_hz,
+        system_id=spec.system_id,
+    )
+    parameters = autopilot.parameters
+    parameters.write("MIS_TAKEOFF_ALT", spec.takeoff_altitude_m, is_int=False)
+    for name, value in spec.parameters.items():
+        if name not in parameters.names:
+            raise ScenarioError(f"{spec.name}: parameters: expected a parameter of {spec.personality}, got {name}")
+        is_int = parameters.is_int(name)
+        typed = float(value) if not is_int else int(value) if value == int(value) else value
+        if not parameters.write(name, typed, is_int=is_int):
+            raise ScenarioError(f"{spec.name}: parameters.{name}: expected a value in its range, got {value}")
+    return autopilot
+
+
+def _disturbed(scenario: Scenario) -> bool:
+    """Something pushes a hovering vehicle aside: position and velocity loops then need their integral."""
+    plain = msgspec.structs.replace(scenario.physics, motor_lag=True, rotor_drag=True, battery_start=1.0)
+    return plain != Physics() or any(fault.what == "gust" for fault in scenario.faults)

@@ -48,7 +48,7 @@ class Lockstep:
         self._progress = progress
         self._desk = Desk(flight.resolved.scenario.operator)
         self._station = Station(
-            flight, wires.router, t_ns=lambda: flight.t_ns, clock_ns=lambda: flight.t_ns, lockstep=True
+            flight.crafts[0], wires.router, t_ns=lambda: flight.t_ns, clock_ns=lambda: flight.t_ns, lockstep=True
         )
         self._answer = Answer(-1, wires.bridge.record_key)
         self._obstacles_ns = -1  # tick up to which frames and markers have left
@@ -111,7 +111,7 @@ class Lockstep:
         flight = self.flight
         self._answer = Answer(flight.t_ns, self._bridge.record_key)
         self._send_obstacles(flight.t_ns)
-        self._station.say(flight.control())
+        self._station.say(flight.control()[0])
         self._station.announce()
         self._station.stream(self._wires.router.onboard)
         # the companion computes now: what it does not wait for is done beside it
@@ -144,7 +144,7 @@ class Lockstep:
         flight = self.flight
         if self._foresees:
             self._send_obstacles(flight.t_ns + flight.resolved.period_ns)
-        if self._offboard_wall is None and flight.autopilot.external:
+        if self._offboard_wall is None and flight.crafts[0].autopilot.external:
             self._offboard_wall = time.perf_counter()
         for _ in range(flight.resolved.control_steps):
             flight.advance()
@@ -209,9 +209,9 @@ class Lockstep:
         if step.at_tick is not None:
             return flight.t_ns >= step.at_tick * flight.resolved.period_ns
         if step.after == "airborne_hover":
-            return flight.autopilot.hovering(flight.t_ns)
+            return flight.crafts[0].autopilot.hovering(flight.t_ns)
         if step.after == "on_ground":
-            return not flight.autopilot.airborne
+            return not flight.crafts[0].autopilot.airborne
         return flight.ended is not None
 
     def _apply(self, step: OperatorStep, offer: Offer) -> bytes:
@@ -241,7 +241,7 @@ class Lockstep:
 
     def _timing(self, began: float) -> dict[str, Any]:
         now = time.perf_counter()
-        flight, judge = self.flight, self.flight.judge
+        flight, judge = self.flight, self.flight.crafts[0].judge
         wall_s = now - began
         factor = None
         if judge is not None and self._offboard_wall is not None:

@@ -1,6 +1,7 @@
 """Motions of obstacles: closed forms of time, so that position and velocity are exact at any instant.
 
 The paper's three cases are `Linear`, `Accelerated` and `FigureEight`; `Static` is the obstacle of its training.
+Motions through points are in `paths`; the one that reacts to a vehicle is in `pursuit`.
 Time is the motions' own clock, which `World.start_motions` starts. Plain floats: these run every physics step.
 """
 
@@ -11,6 +12,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 Point = tuple[float, float, float]
+
+AWAY_ENU: Point = (0.0, 0.0, -1e4)  # where an obstacle is while it is not there: out of reach of everything
 
 
 class Motion(Protocol):
@@ -91,16 +94,69 @@ class FigureEight:
     def position(self, t_s: float) -> Point:
         theta = 2.0 * math.pi * t_s / self.period_s + self.phase_rad
         sine = math.sin(theta)
-        return self._along(self.center_enu, self.size_m * sine, self.size_m * sine * math.cos(theta))
+        along, across = self.size_m * sine, self.size_m * sine * math.cos(theta)
+        return _in_plane(self.center_enu, along, across, self.axis_yaw_rad, self.tilt_rad)
 
     def velocity(self, t_s: float) -> Point:
         theta_rate = 2.0 * math.pi / self.period_s
         theta = theta_rate * t_s + self.phase_rad
         speed = self.size_m * theta_rate
-        return self._along((0.0, 0.0, 0.0), speed * math.cos(theta), speed * math.cos(2.0 * theta))
+        along, across = speed * math.cos(theta), speed * math.cos(2.0 * theta)
+        return _in_plane((0.0, 0.0, 0.0), along, across, self.axis_yaw_rad, self.tilt_rad)
 
-    def _along(self, origin: Point, along_e1: float, along_e2: float) -> Point:
-        cos_yaw, sin_yaw = math.cos(self.axis_yaw_rad), math.sin(self.axis_yaw_rad)
-        level, up = along_e2 * math.cos(self.tilt_rad), along_e2 * math.sin(self.tilt_rad)
-        x, y, z = origin
-        return (x + along_e1 * cos_yaw - level * sin_yaw, y + along_e1 * sin_yaw + level * cos_yaw, z + up)
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """With theta = +-2 pi t / period + phase (minus: clockwise),
+
+        p(t) = center + radius cos(theta) e1 + radius sin(theta) e2,
+
+    e1 and e2 as for `FigureEight`. The speed is 2 pi radius / period throughout.
+    """
+
+    center_enu: Point
+    radius_m: float
+    period_s: float
+    phase_rad: float = 0.0
+    axis_yaw_rad: float = 0.0
+    tilt_rad: float = 0.0
+    clockwise: bool = False
+
+    def position(self, t_s: float) -> Point:
+        theta = self._theta_rate * t_s + self.phase_rad
+        along, across = self.radius_m * math.cos(theta), self.radius_m * math.sin(theta)
+        return _in_plane(self.center_enu, along, across, self.axis_yaw_rad, self.tilt_rad)
+
+    def velocity(self, t_s: float) -> Point:
+        rate = self._theta_rate
+        theta, speed = rate * t_s + self.phase_rad, self.radius_m * rate
+        return _in_plane(
+            (0.0, 0.0, 0.0), -speed * math.sin(theta), speed * math.cos(theta), self.axis_yaw_rad, self.tilt_rad
+        )
+
+    @property
+    def _theta_rate(self) -> float:
+        return (-2.0 if self.clockwise else 2.0) * math.pi / self.period_s
+
+
+@dataclass(frozen=True, slots=True)
+class Timed:
+    """A motion whose obstacle is there from ``start_s`` until just before ``end_s``, and at `AWAY_ENU` else."""
+
+    motion: Motion
+    start_s: float = 0.0
+    end_s: float = math.inf
+
+    def position(self, t_s: float) -> Point:
+        return self.motion.position(t_s) if self.start_s <= t_s < self.end_s else AWAY_ENU
+
+    def velocity(self, t_s: float) -> Point:
+        return self.motion.velocity(t_s) if self.start_s <= t_s < self.end_s else (0.0, 0.0, 0.0)
+
+
+def _in_plane(origin: Point, along_e1: float, along_e2: float, axis_yaw_rad: float, tilt_rad: float) -> Point:
+    """origin + along_e1 e1 + along_e2 e2."""
+    cos_yaw, sin_yaw = math.cos(axis_yaw_rad), math.sin(axis_yaw_rad)
+    level, up = along_e2 * math.cos(tilt_rad), along_e2 * math.sin(tilt_rad)
+    x, y, z = origin
+    return (x + along_e1 * cos_yaw - level * sin_yaw, y + along_e1 * sin_yaw + level * cos_yaw, z + up)

@@ -1,40 +1,33 @@
-"""The world: one Crazyflie, moving spheres and the ground in PyBullet, advanced one physics step at a time.
+"""The world: vehicles, moving spheres and the ground in PyBullet, advanced one physics step at a time.
 
-Each step: rotor speeds follow their commands with first-order lag; every rotor pushes with k_f w^2 where it stands
-and turns the body with c k_m w^2; rotor drag F = -k (sum w) v acts in body axes; PyBullet integrates. The vehicle
-is moved by these forces and by contacts alone: nothing here sets its pose or velocity once it is built.
+Each step the air acts (`air`), the vehicles' rotors push (`body`), PyBullet integrates, the spheres move to where their
+motions say, and the batteries discharge (`battery`).
 
-Contacts follow clearance: when PyBullet looks for contacts the spheres stand where clearance was last taken, and it
-makes a contact of two spheres only from zero distance on. So no push can keep a collision from being seen.
+Contacts follow clearance: when PyBullet looks for contacts, spheres and vehicles stand where clearance was last taken,
+and it makes a contact of two spheres only from zero distance on. So no push can keep a collision from being seen.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from types import TracebackType
 
+import numpy as np
 import pybullet
 
-from sim_bridge.crazyflie import SPIN_TORQUE_SIGN, Crazyflie, Quad, Triple
+from sim_bridge.air import Air
+from sim_bridge.battery import Battery
+from sim_bridge.body import Body, BodyState, Start, to_body
+from sim_bridge.crazyflie import Crazyflie, Quad, Triple
 from sim_bridge.errors import ScenarioError
 from sim_bridge.obstacles import Motion, Point
+from sim_bridge.scenario_world import Physics
 
-_RAD_S_PER_RPM = 2.0 * math.pi / 60.0
-_GROUND_CONTACT_M = 1e-3
-_ORIGIN = (0.0, 0.0, 0.0)
+__all__ = ["BodyState", "Start", "World", "control_steps", "to_body"]
+
 _LEVEL_XYZW = (0.0, 0.0, 0.0, 1.0)
-
-
-@dataclass(frozen=True, slots=True)
-class BodyState:
-    """The vehicle's centre of mass, ENU; attitude as enu_from_flu (w, x, y, z)."""
-
-    p_enu: Triple  # [m]
-    v_enu: Triple  # [m/s]
-    q_wxyz: Quad
-    omega_flu: Triple  # body rates [rad/s]
+_BATTERY_HZ = 20  # at which batteries discharge where they do not act on the flight
 
 
 def control_steps(physics_hz: int, control_hz: int) -> int:
@@ -53,58 +46,61 @@ def control_steps(physics_hz: int, control_hz: int) -> int:
     return physics_hz // control_hz
 
 
+_PLAIN = Physics()
+
+
 class World:
-    """One vehicle among moving spheres above the ground z = 0; a PyBullet client of its own in DIRECT mode.
+    """Vehicles among moving spheres above the ground z = 0; a PyBullet client of its own in DIRECT mode.
 
     Args:
-        vehicle: its parameters.
+        vehicles: the parameters of each, at least one.
         motions, radii_m: one of each per obstacle.
         physics_hz: steps a second.
-        start_enu: where the vehicle's centre starts, at rest; z at least its radius [m].
-        start_yaw_rad: heading of the body's x axis from east, towards north.
+        starts: one per vehicle; no two vehicles may touch there.
+        effects: which act; by default motor lag and rotor drag.
+        rngs: one generator per vehicle for its gusts; none needed without.
     Raises:
-        ScenarioError: a number of radii unlike that of the motions, a start below the ground, or a bad rate.
+        ScenarioError: numbers that do not match, a start below the ground or inside another, or a bad rate.
     """
 
     def __init__(
         self,
-        vehicle: Crazyflie,
+        vehicles: Sequence[Crazyflie],
         motions: Sequence[Motion],
         *,
         radii_m: Sequence[float],
         physics_hz: int,
-        start_enu: Point,
-        start_yaw_rad: float = 0.0,
+        starts: Sequence[Start],
+        effects: Physics = _PLAIN,
+        rngs: Sequence[np.random.Generator] = (),
     ) -> None:
         if len(radii_m) != len(motions):
             raise ScenarioError(f"radii_m: expected {len(motions)} values, one for each motion, got {len(radii_m)}")
-        if start_enu[2] < vehicle.radius_m:
-            raise ScenarioError(f"start_enu: expected z at least the radius {vehicle.radius_m} m, got {start_enu[2]}")
         if physics_hz < 1:
             raise ScenarioError(f"physics_hz: expected a positive whole number, got {physics_hz}")
-        self.vehicle = vehicle
+        _check_starts(vehicles, starts)
+        self.vehicles = tuple(vehicles)
         self.motions = tuple(motions)
         self.radii_m = tuple(float(radius_m) for radius_m in radii_m)
         self.physics_hz = physics_hz
         self.step_count = 0
-        self.rotor_rpm: Quad = (0.0, 0.0, 0.0, 0.0)
+        self.batteries = tuple(Battery(effects.battery_start) for _ in vehicles)
+        self._sag = effects.battery_sag
+        self._battery_steps = 1 if self._sag else max(1, physics_hz // _BATTERY_HZ)
         self._motions_from_step: int | None = None
-        self._rotors_flu = vehicle.rotor_positions_flu
-        # exact solution of the lag over one step with the command held
-        self._lag_up = -math.expm1(-1.0 / (physics_hz * vehicle.motor_up_s))
-        self._lag_down = -math.expm1(-1.0 / (physics_hz * vehicle.motor_down_s))
         self._client = pybullet.connect(pybullet.DIRECT)
-        self._build(start_enu, start_yaw_rad)
+        self._build(starts, effects)
+        self._air = Air(effects, self.bodies, physics_hz=physics_hz, rngs=rngs)
+        self.states: tuple[BodyState, ...] = tuple(body.state for body in self.bodies)
         self.obstacles_enu = self.obstacle_positions(0.0)  # true centres at this step [m]
-        self.state = self._read_state()
-        self.clearance_m = self._clearance()
-        self.min_clearance_m = self.clearance_m
-        self.touched_ground = self.on_ground
+        self.clearances_m = self._clearances()  # surface to surface, of each vehicle from all else but the ground [m]
+        self.min_clearances_m = list(self.clearances_m)
+        self.touched_ground = [body.on_ground for body in self.bodies]
 
-    def _build(self, start_enu: Point, start_yaw_rad: float) -> None:
+    def _build(self, starts: Sequence[Start], effects: Physics) -> None:
         client = self._client
         pybullet.setTimeStep(1.0 / self.physics_hz, physicsClientId=client)
-        pybullet.setGravity(0.0, 0.0, -self.vehicle.g_m_s2, physicsClientId=client)
+        pybullet.setGravity(0.0, 0.0, -self.vehicles[0].g_m_s2, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
         plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
         ground = pybullet.createMultiBody(0.0, plane, physicsClientId=client)
@@ -112,7 +108,17 @@ class World:
         pybullet.changeDynamics(
             ground, -1, lateralFriction=1.0, rollingFriction=1.0, spinningFriction=1.0, physicsClientId=client
         )
-        self._body = self._build_vehicle(start_enu, start_yaw_rad)
+        self.bodies = tuple(
+            Body(
+                client,
+                vehicle,
+                start,
+                physics_hz=self.physics_hz,
+                motor_lag=effects.motor_lag,
+                rotor_drag=effects.rotor_drag,
+            )
+            for vehicle, start in zip(self.vehicles, starts, strict=True)
+        )
         self._spheres = [
             pybullet.createMultiBody(
                 0.0, self._sphere(radius_m), basePosition=motion.position(0.0), physicsClientId=client
@@ -120,84 +126,57 @@ class World:
             for motion, radius_m in zip(self.motions, self.radii_m, strict=True)
         ]
 
-    def _build_vehicle(self, start_enu: Point, start_yaw_rad: float) -> int:
-        vehicle = self.vehicle
-        body: int = pybullet.createMultiBody(
-            baseMass=vehicle.mass_kg,
-            baseCollisionShapeIndex=self._sphere(vehicle.radius_m),
-            basePosition=start_enu,
-            baseOrientation=(0.0, 0.0, math.sin(0.5 * start_yaw_rad), math.cos(0.5 * start_yaw_rad)),
-            physicsClientId=self._client,
-        )
-        # PyBullet would take the inertia of the collision sphere and damp 4 % of the speed a second
-        pybullet.changeDynamics(
-            body,
-            -1,
-            localInertiaDiagonal=vehicle.inertia_kg_m2,
-            linearDamping=0.0,
-            angularDamping=0.0,
-            rollingFriction=0.01,
-            spinningFriction=0.01,
-            activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-            physicsClientId=self._client,
-        )
-        return body
-
     def _sphere(self, radius_m: float) -> int:
         shape: int = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=radius_m, physicsClientId=self._client)
         return shape
 
     @property
     def t_s(self) -> float:
-        """Time of the vehicle: physics steps taken over their rate."""
+        """Time of the world: physics steps taken over their rate."""
         return self.step_count / self.physics_hz
 
-    def step(self, rpm_command: Quad) -> None:
-        """Advance one physics step with the rotor speeds commanded to ``rpm_command`` (clipped to the motors')."""
-        client, body = self._client, self._body
-        self.rotor_rpm = self._follow(rpm_command)
-        k_f, k_m, link_frame = self.vehicle.k_f, self.vehicle.k_m, pybullet.LINK_FRAME
-        torque_z_n_m = 0.0
-        for rpm, position_flu, sign in zip(self.rotor_rpm, self._rotors_flu, SPIN_TORQUE_SIGN, strict=True):
-            squared = rpm * rpm
-            torque_z_n_m += sign * k_m * squared
-            pybullet.applyExternalForce(body, -1, (0.0, 0.0, k_f * squared), position_flu, link_frame, client)
-        pybullet.applyExternalTorque(body, -1, (0.0, 0.0, torque_z_n_m), link_frame, client)
-        pybullet.applyExternalForce(body, -1, self._drag_flu(), _ORIGIN, link_frame, client)
-        pybullet.stepSimulation(client)
+    @property
+    def t_ns(self) -> int:
+        return self.step_count * 1_000_000_000 // self.physics_hz
+
+    def step(self, rpm_commands: Sequence[Quad]) -> None:
+        """Advance one physics step; one set of rotor speed commands per vehicle (clipped to the motors') [RPM]."""
+        if self._air.stirred:
+            self._air.stir(self.t_s)
+        for body, command in zip(self.bodies, rpm_commands, strict=True):
+            body.push(command)
+        pybullet.stepSimulation(self._client)
         self.step_count += 1
         if self._motions_from_step is not None:
             self._move_obstacles()
-        self.state = self._read_state()
-        self.clearance_m = self._clearance()
-        self.min_clearance_m = min(self.min_clearance_m, self.clearance_m)
-        self.touched_ground = self.touched_ground or self.on_ground
+        if self.step_count % self._battery_steps == 0:
+            self._discharge()
+        self.states = tuple([body.read() for body in self.bodies])
+        self.clearances_m = self._clearances()
+        for index, clearance_m in enumerate(self.clearances_m):
+            if clearance_m < self.min_clearances_m[index]:
+                self.min_clearances_m[index] = clearance_m
+            if not self.touched_ground[index]:
+                self.touched_ground[index] = self.bodies[index].on_ground
 
-    def _follow(self, rpm_command: Quad) -> Quad:
-        up, down, top = self._lag_up, self._lag_down, self.vehicle.max_rpm
-        speeds = []
-        for rpm, command in zip(self.rotor_rpm, rpm_command, strict=True):
-            error = min(max(command, 0.0), top) - rpm
-            speeds.append(rpm + (up if error > 0.0 else down) * error)
-        w0, w1, w2, w3 = speeds
-        return (w0, w1, w2, w3)
+    def _discharge(self) -> None:
+        dt_s = self._battery_steps / self.physics_hz
+        for body, battery in zip(self.bodies, self.batteries, strict=True):
+            battery.draw(body.thrusts_n, dt_s)
+            if self._sag:
+                body.limit(battery.available)
 
-    def _drag_flu(self) -> Triple:
-        """-k (sum of rotor speeds, rad/s) v in body axes [N]."""
-        total = sum(self.rotor_rpm) * _RAD_S_PER_RPM
-        vx, vy, vz = to_body(self.state.q_wxyz, self.state.v_enu)
-        xy, z = -total * self.vehicle.drag_xy_kg_rad, -total * self.vehicle.drag_z_kg_rad
-        return (xy * vx, xy * vy, z * vz)
-
-    def _read_state(self) -> BodyState:
-        p_enu, (x, y, z, w) = pybullet.getBasePositionAndOrientation(self._body, self._client)
-        v_enu, omega_enu = pybullet.getBaseVelocity(self._body, self._client)
-        q_wxyz = (w, x, y, z)
-        return BodyState(p_enu, v_enu, q_wxyz, to_body(q_wxyz, omega_enu))
+    def gust(self, v_enu: Triple, for_s: float) -> None:
+        """Add a wind of ``v_enu`` [m/s] everywhere for ``for_s``, from the next step on."""
+        self._air.gust(v_enu, self.t_s + for_s)
 
     def start_motions(self) -> None:
         """Start the motions' clock at this step; before it obstacles wait where they are at t = 0."""
         self._motions_from_step = self.step_count
+
+    @property
+    def motions_started(self) -> bool:
+        return self._motions_from_step is not None
 
     def motion_time_s(self, t_s: float) -> float:
         """The motions' clock at vehicle time ``t_s``, 0 before they start."""
@@ -222,27 +201,33 @@ class World:
         for sphere, p_enu in zip(self._spheres, self.obstacles_enu, strict=True):
             pybullet.resetBasePositionAndOrientation(sphere, p_enu, _LEVEL_XYZW, self._client)
 
-    def _clearance(self) -> float:
-        """min over obstacles of |p - p_o| - r_d - r_o [m]; inf without obstacles."""
-        nearest = math.inf
-        p_enu, radius_m = self.state.p_enu, self.vehicle.radius_m
-        for p_o_enu, r_o_m in zip(self.obstacles_enu, self.radii_m, strict=True):
-            nearest = min(nearest, math.dist(p_enu, p_o_enu) - radius_m - r_o_m)
-        return nearest
+    def _clearances(self) -> tuple[float, ...]:
+        """min over obstacles and other vehicles of |p - p_o| - r_d - r_o [m]; inf where there is nothing else."""
+        nearest = []
+        for body in self.bodies:
+            p_enu, radius_m, nearest_m = body.state.p_enu, body.vehicle.radius_m, math.inf
+            for p_o_enu, r_o_m in zip(self.obstacles_enu, self.radii_m, strict=True):
+                clearance_m = math.dist(p_enu, p_o_enu) - radius_m - r_o_m
+                if clearance_m < nearest_m:
+                    nearest_m = clearance_m
+            nearest.append(nearest_m)
+        for j in range(1, len(nearest)):
+            for i in range(j):
+                one, other = self.bodies[i], self.bodies[j]
+                distance_m = math.dist(one.state.p_enu, other.state.p_enu)
+                clearance_m = distance_m - one.vehicle.radius_m - other.vehicle.radius_m
+                nearest[i], nearest[j] = min(nearest[i], clearance_m), min(nearest[j], clearance_m)
+        return tuple(nearest)
 
-    def reset_min_clearance(self) -> None:
-        """Begin ``min_clearance_m`` and ``touched_ground`` anew with this step."""
-        self.min_clearance_m = self.clearance_m
-        self.touched_ground = self.on_ground
+    def reset_min_clearance(self, index: int = 0) -> None:
+        """Begin ``min_clearances_m`` and ``touched_ground`` of a vehicle anew with this step."""
+        self.min_clearances_m[index] = self.clearances_m[index]
+        self.touched_ground[index] = self.bodies[index].on_ground
 
-    @property
-    def on_ground(self) -> bool:
-        """The collision sphere touches the ground at this step."""
-        return self.state.p_enu[2] - self.vehicle.radius_m <= _GROUND_CONTACT_M
-
-    def closest_points_m(self, index: int) -> float:
-        """Distance from the vehicle to obstacle ``index`` as PyBullet's own narrow phase finds it [m]."""
-        points = pybullet.getClosestPoints(self._body, self._spheres[index], 1e3, physicsClientId=self._client)
+    def closest_points_m(self, index: int, vehicle: int = 0) -> float:
+        """Distance from a vehicle to obstacle ``index`` as PyBullet's own narrow phase finds it [m]."""
+        body = self.bodies[vehicle].number
+        points = pybullet.getClosestPoints(body, self._spheres[index], 1e3, physicsClientId=self._client)
         return float(min(point[8] for point in points))
 
     def close(self) -> None:
@@ -260,14 +245,16 @@ class World:
         self.close()
 
 
-def to_body(q_wxyz: Quad, v_enu: Triple) -> Triple:
-    """FLU components of an ENU vector: R^T v."""
-    w, x, y, z = q_wxyz
-    a, b, c = v_enu
-    # v + 2 w (v x u) + 2 (v x u) x u with u = (x, y, z)
-    cx, cy, cz = b * z - c * y, c * x - a * z, a * y - b * x
-    return (
-        a + 2.0 * (w * cx + cy * z - cz * y),
-        b + 2.0 * (w * cy + cz * x - cx * z),
-        c + 2.0 * (w * cz + cx * y - cy * x),
-    )
+def _check_starts(vehicles: Sequence[Crazyflie], starts: Sequence[Start]) -> None:
+    if not vehicles:
+        raise ScenarioError("vehicles: expected at least one")
+    if len(starts) != len(vehicles):
+        raise ScenarioError(f"starts: expected {len(vehicles)} values, one for each vehicle, got {len(starts)}")
+    for index, (vehicle, start) in enumerate(zip(vehicles, starts, strict=True)):
+        if start.p_enu[2] < vehicle.radius_m:
+            raise ScenarioError(f"start: expected z at least the radius {vehicle.radius_m} m, got {start.p_enu[2]}")
+        for other, at in zip(vehicles[:index], starts[:index], strict=True):
+            apart_m = math.dist(start.p_enu, at.p_enu)
+            if apart_m <= vehicle.radius_m + other.radius_m:
+                least_m = vehicle.radius_m + other.radius_m
+                raise ScenarioError(f"start: expected vehicles more than {least_m:g} m apart, got {apart_m:g} m")

@@ -104,7 +104,9 @@ class RealTime:
         self._late_ns = 0
         self._stopped = False
         self._ends = flight.resolved.scenario.end.stop and not stay
-        self._station = Station(flight, wires.router, t_ns=lambda: flight.t_ns, clock_ns=self._clock_ns, lockstep=False)
+        self._station = Station(
+            flight.crafts[0], wires.router, t_ns=lambda: flight.t_ns, clock_ns=self._clock_ns, lockstep=False
+        )
 
     def stop(self) -> None:
         self._stopped = True
@@ -151,7 +153,7 @@ class RealTime:
 
     def _tick(self) -> None:
         flight = self.flight
-        self._station.say(flight.control())
+        self._station.say(flight.control()[0])
         self._station.announce()
         self._publish()
         self._station.stream(*self._wires.router.links)
@@ -169,7 +171,7 @@ class RealTime:
 def due_frames(flight: Flight, t_ns: int) -> Iterator[tuple[str, bytes]]:
     """Encoded frames that have arrived by ``t_ns``, source by source."""
     for spec in flight.resolved.scenario.sensors:
-        for frame in flight.frames(spec.source, t_ns):
+        for frame in flight.crafts[0].frames(spec.source, t_ns):
             yield spec.source, encode_frame(frame, spec.sigma_m)
 
 

@@ -1,8 +1,8 @@
 """Scenario files: TOML decoded once into frozen typed values; `placement.resolve` makes them concrete with a seed.
 
 An unknown key, a wrong type or a value out of range is a `ScenarioError` of one line that names file and key.
-A motion is placed either by its own origin or by ``cross_point`` and ``cross_at_s``: it then passes that point that
-long after the obstacles' start (which is the vehicle's entry into offboard).
+The tables live in modules of their own: `scenario_obstacles`, `scenario_world` ([physics]) and `scenario_faults`
+([[faults]] and [expect]); `scenario_checks` holds what one table demands of another.
 """
 
 from __future__ import annotations
@@ -14,84 +14,102 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from sim_bridge.errors import ScenarioError
 from sim_bridge.physics import control_steps
+from sim_bridge.scenario_checks import check
+from sim_bridge.scenario_faults import Expectation, Fault
+from sim_bridge.scenario_obstacles import (
+    AcceleratedObstacle,
+    CircleObstacle,
+    EightObstacle,
+    Jitter,
+    LinearObstacle,
+    Obstacle,
+    PursuitObstacle,
+    SplineObstacle,
+    StaticObstacle,
+    TrackObstacle,
+    WaypointsObstacle,
+)
+from sim_bridge.scenario_types import (
+    Coordinate,
+    Degrees,
+    Name,
+    NonNegative,
+    Point,
+    Positive,
+    Probability,
+    Table,
+    Tick,
+)
+from sim_bridge.scenario_world import Physics
 
-Coordinate = Annotated[float, Meta(ge=-1e3, le=1e3)]
-Point: TypeAlias = tuple[Coordinate, Coordinate, Coordinate]
-Positive = Annotated[float, Meta(gt=0.0, le=1e4)]
-NonNegative = Annotated[float, Meta(ge=0.0, le=1e4)]
-Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
-Tick = Annotated[int, Meta(ge=0, le=10_000_000)]
+__all__ = [
+    "BUILTIN",
+    "AcceleratedObstacle",
+    "CircleObstacle",
+    "Coordinate",
+    "EightObstacle",
+    "End",
+    "Expectation",
+    "Fault",
+    "Jitter",
+    "LinearObstacle",
+    "Obstacle",
+    "OperatorStep",
+    "Physics",
+    "Point",
+    "PursuitObstacle",
+    "Scenario",
+    "SensorSpec",
+    "SplineObstacle",
+    "StaticObstacle",
+    "Target",
+    "TrackObstacle",
+    "Vehicle",
+    "WaypointsObstacle",
+    "load_scenario",
+    "parse_scenario",
+    "scenario_names",
+]
 
 BUILTIN = (Path(__file__).parent / "configs", Path(__file__).parent.parent / "configs")  # installed, checkout
+_FOLDERS = ("", "scenarios")  # of each, in which scenarios are found by name
+
+ParameterName = Annotated[str, Meta(pattern=r"^[A-Z][A-Z0-9_]{0,15}$")]
+ConfigKey = Annotated[str, Meta(pattern=r"^[a-z0-9_]+(\.[a-z0-9_]+)*$")]
+ConfigScalar: TypeAlias = bool | int | float | str
+Port = Annotated[int, Meta(ge=1, le=65535)]
 
 
-class Vehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Vehicle(Table, frozen=True, kw_only=True):
+    """One vehicle. Of several, the n-th is by default ``uav<n>`` with system id n."""
+
+    name: Name = "uav1"  # its Zenoh prefix is uav/<name>
+    system_id: Annotated[int, Meta(ge=1, le=250)] = 1
+    personality: Literal["px4", "ardupilot"] = "px4"
     start: Point = (0.0, 0.0, 0.2)  # centre of the vehicle, local ENU [m]; 0.2 stands on the ground
-    yaw_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] = 0.0  # counter-clockwise from east
+    yaw_deg: Degrees = 0.0  # counter-clockwise from east
     takeoff_altitude_m: Annotated[float, Meta(ge=0.5, le=80.0)] = 1.5
+    target: Point | None = None  # of this vehicle; None: that of [target]
+    onboard_port: Port | None = None  # None: the command line's plus the vehicle's index
+    gcs_port: Port | None = None
+    parameters: dict[ParameterName, bool | int | float] = msgspec.field(default_factory=dict)  # the autopilot's
+    daemon: dict[ConfigKey, ConfigScalar | list[ConfigScalar]] = msgspec.field(default_factory=dict)  # its `--set`
 
     @property
     def yaw_rad(self) -> float:
         return math.radians(self.yaw_deg)
 
 
-class Target(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Target(Table, frozen=True, kw_only=True):
     position: Point
 
 
-class Jitter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Half widths of the uniform draws of a seed."""
-
-    position_m: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)  # of the origin or crossing point
-    time_s: NonNegative = 0.0  # of cross_at_s
-    yaw_deg: NonNegative = 0.0  # the whole motion about the vertical through its origin or crossing point
-
-
-class _Placed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="motion"):
-    """What every obstacle states."""
-
-    id: Name
-    radius_m: Positive = 0.2
-    origin: Point | None = None
-    cross_point: Point | None = None
-    cross_at_s: NonNegative | None = None
-    jitter: Jitter = Jitter()
-
-
-class StaticObstacle(_Placed, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="static"):
-    pass
-
-
-class LinearObstacle(_Placed, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="linear"):
-    velocity: Point  # [m/s]
-
-
-class AcceleratedObstacle(_Placed, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="accelerated"):
-    velocity: Point  # at the start [m/s]
-    acceleration: Point  # [m/s^2]
-
-
-class EightObstacle(_Placed, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="figure_eight"):
-    """A lemniscate whose ``origin`` is its centre; ``cross_phase_deg`` is its phase at the crossing, 0 the centre."""
-
-    size_m: Positive  # reach along its axis; half of it across
-    period_s: Positive
-    phase_deg: float | None = None
-    cross_phase_deg: float = 0.0
-    axis_yaw_deg: float = 90.0
-    tilt_deg: Annotated[float, Meta(ge=-180.0, le=180.0)] = 0.0
-
-
-Obstacle: TypeAlias = StaticObstacle | LinearObstacle | AcceleratedObstacle | EightObstacle
-
-
-class SensorSpec(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An external sensor that sees every obstacle."""
+class SensorSpec(Table, frozen=True, kw_only=True):
+    """An external sensor; by default it sees every obstacle and, from each vehicle, the other vehicles."""
 
     source: Name = "sim"
     rate_hz: Annotated[float, Meta(gt=0.0, le=1000.0)] = 20.0
@@ -99,17 +117,26 @@ class SensorSpec(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     latency_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.05
     dropout: Probability = 0.05  # of one obstacle of one frame
     frame_dropout: Probability = 0.0  # of a whole frame
+    range_m: Positive | None = None  # from the vehicle's centre; None: unlimited
+    fov_deg: Annotated[float, Meta(gt=0.0, le=360.0)] = 360.0  # full horizontal angle about the body x axis
+    fov_up_deg: Annotated[float, Meta(gt=0.0, le=180.0)] = 180.0  # full vertical angle about the body xy plane
+    clutter: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0  # mean number of false detections a frame (Poisson)
+    clutter_box: tuple[Point, Point] | None = None  # opposite corners, ENU; None: within the range and field of view
+    clutter_radius_m: Positive = 0.2
+    anonymous: bool = False  # detections without ids
+    vehicles: tuple[Name, ...] | None = None  # names of those that carry it; None: all
 
 
-class OperatorStep(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class OperatorStep(Table, frozen=True, kw_only=True):
     """What the operator does, and when in lockstep: at a tick, or at the first tick at which a condition holds."""
 
     do: Literal["arm", "takeoff", "engage", "release", "hold", "land", "disarm"]
     at_tick: Tick | None = None
     after: Literal["airborne_hover", "on_ground", "end"] | None = None
+    vehicle: Name | None = None  # None: every vehicle
 
 
-class End(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class End(Table, frozen=True, kw_only=True):
     """The run ends when the target is reached (passed within ``reach_m``, then within ``hold_m`` for ``hold_s``),
     ``collision_s`` after a touch, or ``timeout_s`` after the vehicle entered offboard. ``stop`` false: never."""
 
@@ -128,16 +155,37 @@ _STEPS = (
 )
 
 
-class Scenario(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Scenario(Table, frozen=True, kw_only=True):
+    """A file. ``vehicle`` is always the first of ``fleet``, whichever form the file uses."""
+
     description: str = ""
     physics_hz: Annotated[int, Meta(ge=1, le=10_000)] = 240
     control_hz: Annotated[int, Meta(ge=1, le=1000)] = 20
     vehicle: Vehicle = Vehicle()
+    vehicles: tuple[Vehicle, ...] = ()
     target: Target | None = None
     obstacles: tuple[Obstacle, ...] = ()
     sensors: tuple[SensorSpec, ...] = (SensorSpec(),)
+    physics: Physics = Physics()
     operator: tuple[OperatorStep, ...] = _STEPS
+    faults: tuple[Fault, ...] = ()
+    expect: Expectation = Expectation()
     end: End = End()
+
+    @property
+    def fleet(self) -> tuple[Vehicle, ...]:
+        """The vehicles, in the file's order."""
+        return self.vehicles or (self.vehicle,)
+
+    def target_of(self, vehicle: Vehicle) -> Point | None:
+        """Where ``vehicle`` is to fly, ENU [m]."""
+        if vehicle.target is not None:
+            return vehicle.target
+        return None if self.target is None else self.target.position
+
+    def carried(self, name: str) -> tuple[tuple[int, SensorSpec], ...]:
+        """The sensors of the vehicle ``name``, each with its index in the file."""
+        return tuple((i, s) for i, s in enumerate(self.sensors) if s.vehicles is None or name in s.vehicles)
 
 
 def load_scenario(name_or_path: str) -> tuple[str, Scenario]:
@@ -157,9 +205,11 @@ def load_scenario(name_or_path: str) -> tuple[str, Scenario]:
 
 
 def parse_scenario(raw: Mapping[str, Any], *, source: str) -> Scenario:
-    """A scenario from decoded TOML; ``source`` names the file in errors."""
+    """A scenario from decoded TOML; ``source`` names the file in errors, and its folder that of recorded tracks."""
+    if "vehicle" in raw and "vehicles" in raw:
+        raise ScenarioError(f"{source}: vehicles: expected [vehicle] or [[vehicles]], not both")
     try:
-        scenario = msgspec.convert(raw, Scenario)
+        scenario = msgspec.convert(_numbered(raw), Scenario)
     except msgspec.ValidationError as error:
         raise ScenarioError(f"{source}: {_pointed(str(error))}") from None
     for key, value in _numbers(raw, ""):
@@ -167,25 +217,47 @@ def parse_scenario(raw: Mapping[str, Any], *, source: str) -> Scenario:
             raise ScenarioError(f"{source}: {key}: expected a finite number, got {value}")
     try:
         control_steps(scenario.physics_hz, scenario.control_hz)
+        check(scenario)
     except ScenarioError as error:
         raise ScenarioError(f"{source}: {error}") from None
-    _check_names(scenario, source)
-    for index, obstacle in enumerate(scenario.obstacles):
-        _check_placing(obstacle, f"{source}: obstacles[{index}]")
-    for index, step in enumerate(scenario.operator):
-        if (step.at_tick is None) == (step.after is None):
-            raise ScenarioError(f"{source}: operator[{index}]: expected exactly one of at_tick and after")
-    return scenario
+    if scenario.vehicles:
+        scenario = msgspec.structs.replace(scenario, vehicle=scenario.vehicles[0])
+    return _with_files_beside(scenario, Path(source).parent)
+
+
+def scenario_names() -> dict[str, Path]:
+    """The shipped scenarios by name."""
+    folders = [base / sub for base in BUILTIN for sub in _FOLDERS if (base / sub).is_dir()]
+    known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.toml"))}
+    known.pop("default", None)  # the daemon's configuration
+    return known
 
 
 def _find(name_or_path: str) -> Path:
     if "/" in name_or_path or name_or_path.endswith(".toml"):
         return Path(name_or_path)
-    known = {path.stem: path for folder in BUILTIN if folder.is_dir() for path in sorted(folder.glob("*.toml"))}
-    known.pop("default", None)  # the daemon's configuration
+    known = scenario_names()
     if name_or_path not in known:
         raise ScenarioError(f"scenario {name_or_path}: expected a TOML file or one of {', '.join(sorted(known))}")
     return known[name_or_path]
+
+
+def _numbered(raw: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``raw`` with the default name and system id of each of several vehicles."""
+    vehicles = raw.get("vehicles")
+    if not isinstance(vehicles, list | tuple) or not all(isinstance(v, Mapping) for v in vehicles):
+        return raw
+    named = [{"name": f"uav{i}", "system_id": i, **vehicle} for i, vehicle in enumerate(vehicles, 1)]
+    return {**raw, "vehicles": named}
+
+
+def _with_files_beside(scenario: Scenario, folder: Path) -> Scenario:
+    """The paths of recorded tracks count from the scenario's folder."""
+    obstacles = tuple(
+        msgspec.structs.replace(o, file=str(folder / o.file)) if isinstance(o, TrackObstacle) else o
+        for o in scenario.obstacles
+    )
+    return scenario if obstacles == scenario.obstacles else msgspec.structs.replace(scenario, obstacles=obstacles)
 
 
 def _pointed(message: str) -> str:
@@ -201,23 +273,3 @@ def _numbers(value: Any, key: str) -> list[tuple[str, float]]:
     if isinstance(value, list | tuple):
         return [pair for i, item in enumerate(value) for pair in _numbers(item, f"{key}[{i}]")]
     return [(key, value)] if isinstance(value, float) else []
-
-
-def _check_names(scenario: Scenario, source: str) -> None:
-    for key, names in (
-        ("obstacles", [o.id for o in scenario.obstacles]),
-        ("sensors", [s.source for s in scenario.sensors]),
-    ):
-        twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
-        if twice is not None:
-            raise ScenarioError(f"{source}: {key}: expected different names, got {twice} twice")
-
-
-def _check_placing(obstacle: Obstacle, at: str) -> None:
-    crossing = obstacle.cross_point is not None
-    if crossing == (obstacle.origin is not None):
-        raise ScenarioError(f"{at}: expected exactly one of origin and cross_point")
-    if crossing != (obstacle.cross_at_s is not None):
-        raise ScenarioError(f"{at}: expected cross_at_s with cross_point, and only with it")
-    if crossing and isinstance(obstacle, EightObstacle) and obstacle.phase_deg is not None:
-        raise ScenarioError(f"{at}: expected cross_phase_deg instead of phase_deg with cross_point")

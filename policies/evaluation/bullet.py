@@ -18,7 +18,7 @@ from policies.evaluation.pointmass import STAY_RADIUS_M, STAY_S, Flights, time_o
 from sim_bridge.controller import AccelerationSetpoint, Controller, PositionSetpoint
 from sim_bridge.crazyflie import Crazyflie
 from sim_bridge.obstacles import Motion
-from sim_bridge.physics import World, control_steps
+from sim_bridge.physics import Start, World, control_steps
 
 PHYSICS_HZ = 240
 CONTROL_HZ = 20
@@ -35,20 +35,20 @@ class BulletVehicle:
     def __init__(self, start_enu: Vec3, motions: Sequence[Motion] = (), radii_m: Sequence[float] = ()) -> None:
         x, y, z = start_enu.tolist()
         vehicle = Crazyflie()
-        self.world = World(vehicle, motions, radii_m=radii_m, physics_hz=PHYSICS_HZ, start_enu=(x, y, z))
+        self.world = World([vehicle], motions, radii_m=radii_m, physics_hz=PHYSICS_HZ, starts=[Start((x, y, z))])
         self._controller = Controller(vehicle, PHYSICS_HZ)
         self._substeps = control_steps(PHYSICS_HZ, CONTROL_HZ)
         self._periods = 0
         hover = PositionSetpoint((x, y, z))
         for _ in range(round(SETTLE_S * PHYSICS_HZ)):
-            self.world.step(self._controller.rpm(self.world.state, hover))
+            self.world.step([self._controller.rpm(self.world.states[0], hover)])
         self.world.start_motions()
         self.world.reset_min_clearance()
 
     @property
     def state(self) -> VehicleState:
         """True position and velocity; stamp 0 is the start of the flight."""
-        body = self.world.state
+        body = self.world.states[0]
         stamp_ns = self._periods * NS_PER_S // CONTROL_HZ
         return VehicleState(stamp_ns, frozen(np.array(body.p_enu)), frozen(np.array(body.v_enu)))
 
@@ -57,7 +57,7 @@ class BulletVehicle:
         x, y, z = a_enu.tolist()
         setpoint = AccelerationSetpoint((x, y, z))
         for _ in range(self._substeps):
-            self.world.step(self._controller.rpm(self.world.state, setpoint))
+            self.world.step([self._controller.rpm(self.world.states[0], setpoint)])
         self._periods += 1
 
     def obstacles(self) -> tuple[FloatArray, FloatArray]:

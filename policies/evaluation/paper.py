@@ -182,14 +182,14 @@ def fly_case(
                 r, v_o = (centres[0] - state.p_enu, velocities[0]) if len(centres) else (FAR_M, np.zeros(3))
                 a = method.end_to_end(state.v_enu, target - state.p_enu, r, v_o)
             centre = centres[0] if len(centres) else np.full(3, np.nan)
-            ticks.append((state.p_enu, state.v_enu, a, centre, np.array(vehicle.world.clearance_m)))
+            ticks.append((state.p_enu, state.v_enu, a, centre, np.array(vehicle.world.clearances_m[0])))
             effort += float(a @ a) * PERIOD_S if arrival.arrived_s is None else 0.0
             vehicle.advance(a)
             arrival.note((step + 1) * PERIOD_S, vehicle.state.p_enu)
-            if vehicle.world.min_clearance_m <= 0.0 or vehicle.world.touched_ground or arrival.reached:
+            if vehicle.world.min_clearances_m[0] <= 0.0 or vehicle.world.touched_ground[0] or arrival.reached:
                 break
-        clearance_m = vehicle.world.min_clearance_m
-        collided = clearance_m <= 0.0 or vehicle.world.touched_ground
+        clearance_m = vehicle.world.min_clearances_m[0]
+        collided = clearance_m <= 0.0 or vehicle.world.touched_ground[0]
     p, v, a, centre, distance = (np.array(column, dtype=np.float64) for column in zip(*ticks, strict=True))
     return Flown(
         np.arange(len(p), dtype=np.float64) * PERIOD_S,

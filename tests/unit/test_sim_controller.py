@@ -14,14 +14,14 @@ from sim_bridge.controller import (
     VelocitySetpoint,
 )
 from sim_bridge.crazyflie import Crazyflie
-from sim_bridge.physics import BodyState, World
+from sim_bridge.physics import BodyState, Start, World
 
 PHYSICS_HZ = 240
 
 
 def airborne(vehicle, physics_hz=PHYSICS_HZ, yaw_rad=0.0):
     """A world with the vehicle at rest in hover and its controller."""
-    world = World(vehicle, (), radii_m=(), physics_hz=physics_hz, start_enu=(0.0, 0.0, 5.0), start_yaw_rad=yaw_rad)
+    world = World([vehicle], (), radii_m=(), physics_hz=physics_hz, starts=[Start((0.0, 0.0, 5.0), yaw_rad)])
     controller = Controller(vehicle, physics_hz)
     fly(world, controller, PositionSetpoint((0.0, 0.0, 5.0), yaw_rad), 4.0)
     return world, controller
@@ -31,8 +31,8 @@ def fly(world, controller, setpoint, seconds):
     """Advance; states after each step."""
     states = []
     for _ in range(round(seconds * world.physics_hz)):
-        world.step(controller.rpm(world.state, setpoint))
-        states.append(world.state)
+        world.step([controller.rpm(world.states[0], setpoint)])
+        states.append(world.states[0])
     return states
 
 
@@ -45,7 +45,7 @@ def step_response(a_enu, *, physics_hz=PHYSICS_HZ, seconds=1.0, yaw_rad=0.0):
     """Acceleration along ``a_enu`` over its length, after a step from hover, without drag; and the path."""
     world, controller = airborne(Crazyflie(drag_xy_kg_rad=0.0, drag_z_kg_rad=0.0), physics_hz, yaw_rad)
     with world:
-        before = world.state
+        before = world.states[0]
         states = [before, *fly(world, controller, AccelerationSetpoint(a_enu, yaw_rad), seconds)]
     velocities = np.array([state.v_enu for state in states])
     acceleration = np.diff(velocities, axis=0) * physics_hz
@@ -103,12 +103,12 @@ def test_zero_acceleration_keeps_hovering():
     world, controller = airborne(Crazyflie())
     with world:
         fly(world, controller, AccelerationSetpoint((0.0, 0.0, 0.0)), 10.0)
-        assert world.state.p_enu == pytest.approx((0.0, 0.0, 5.0), abs=0.02)
+        assert world.states[0].p_enu == pytest.approx((0.0, 0.0, 5.0), abs=0.02)
 
 
 def test_takes_off_and_holds_within_2_cm():
     vehicle = Crazyflie()
-    with World(vehicle, (), radii_m=(), physics_hz=PHYSICS_HZ, start_enu=(1.0, -1.0, 0.2)) as world:
+    with World([vehicle], (), radii_m=(), physics_hz=PHYSICS_HZ, starts=[Start((1.0, -1.0, 0.2))]) as world:
         controller = Controller(vehicle, PHYSICS_HZ)
         hold = PositionSetpoint((1.0, -1.0, 1.5), 0.0, 1.0)
         climb = fly(world, controller, hold, 5.0)
@@ -137,9 +137,9 @@ def test_velocity_setpoint():
     with world:
         fly(world, controller, VelocitySetpoint((1.0, -1.0, 0.5)), 3.0)
         # rotor drag, which nothing integrates away, costs a few per cent
-        assert world.state.v_enu == pytest.approx((1.0, -1.0, 0.5), rel=0.08)
+        assert world.states[0].v_enu == pytest.approx((1.0, -1.0, 0.5), rel=0.08)
         fly(world, controller, VelocitySetpoint((0.0, 0.0, 0.0)), 3.0)
-        assert world.state.v_enu == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+        assert world.states[0].v_enu == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
 
 
 @pytest.mark.parametrize(("start_rad", "goal_rad"), [(0.0, 1.5), (3.0, -3.0), (-1.0, 2.0)])
@@ -163,25 +163,25 @@ def test_tilt_is_limited():
 def test_recovers_from_a_tumble():
     world, controller = airborne(Crazyflie())
     with world:
-        hover = world.vehicle.hover_rpm
+        hover = world.vehicles[0].hover_rpm
         for _ in range(60):
-            world.step((0.0, hover, hover, hover))
-        assert upright(world.state) < 0.5
+            world.step([(0.0, hover, hover, hover)])
+        assert upright(world.states[0]) < 0.5
         controller.reset()
         fly(world, controller, PositionSetpoint((0.0, 0.0, 5.0)), 6.0)
-        assert world.state.p_enu == pytest.approx((0.0, 0.0, 5.0), abs=0.05)
+        assert world.states[0].p_enu == pytest.approx((0.0, 0.0, 5.0), abs=0.05)
 
 
 def test_motors_off():
     world, controller = airborne(Crazyflie())
     with world:
-        assert controller.rpm(world.state, MotorsOff()) == (0.0,) * 4
+        assert controller.rpm(world.states[0], MotorsOff()) == (0.0,) * 4
 
 
 def test_a_stranger_as_setpoint_is_refused():
     world, controller = airborne(Crazyflie())
     with world, pytest.raises(TypeError, match="setpoint: expected one of"):
-        controller.rpm(world.state, None)
+        controller.rpm(world.states[0], None)
 
 
 @pytest.mark.parametrize(
@@ -196,16 +196,16 @@ def test_a_stranger_as_setpoint_is_refused():
 def test_torques_turn_the_body_as_they_say(torque, axis, drift, sign):
     world, controller = airborne(Crazyflie())
     with world:
-        command = controller.mix(world.vehicle.weight_n, tuple(sign * part for part in torque))
+        command = controller.mix(world.vehicles[0].weight_n, tuple(sign * part for part in torque))
         for _ in range(36):
-            world.step(command)
-        rates = np.array(world.state.omega_flu)
+            world.step([command])
+        rates = np.array(world.states[0].omega_flu)
         assert sign * rates[axis] > 0.3
         assert np.delete(rates, axis) == pytest.approx(0.0, abs=1e-2)
-        moved = sign * np.array(world.state.v_enu[:2])
+        moved = sign * np.array(world.states[0].v_enu[:2])
         assert moved @ drift >= 0.01 * np.dot(drift, drift)
         assert moved @ np.array([-drift[1], drift[0]]) == pytest.approx(0.0, abs=1e-3)
-        assert abs(world.state.v_enu[2]) < 0.05
+        assert abs(world.states[0].v_enu[2]) < 0.05
 
 
 def wrench(command, vehicle):
@@ -249,9 +249,9 @@ def test_reset_forgets_the_last_rate():
     with world:
         fly(world, controller, AccelerationSetpoint((3.0, 1.0, 0.0)), 0.05)
         setpoint = AccelerationSetpoint((0.0, 0.0, 0.0))
-        fresh = Controller(world.vehicle, PHYSICS_HZ).rpm(world.state, setpoint)
+        fresh = Controller(world.vehicles[0], PHYSICS_HZ).rpm(world.states[0], setpoint)
         controller.reset()
-        assert controller.rpm(world.state, setpoint) == fresh
+        assert controller.rpm(world.states[0], setpoint) == fresh
 
 
 def test_torque_balances_the_gyroscopic_moment():

@@ -12,7 +12,7 @@ from sim_bridge.controller import Controller, PositionSetpoint
 from sim_bridge.crazyflie import Crazyflie
 from sim_bridge.errors import ScenarioError
 from sim_bridge.obstacles import Accelerated, FigureEight, Linear, Static
-from sim_bridge.physics import World, control_steps, to_body
+from sim_bridge.physics import Start, World, control_steps, to_body
 
 OFF = (0.0, 0.0, 0.0, 0.0)
 
@@ -20,12 +20,11 @@ OFF = (0.0, 0.0, 0.0, 0.0)
 def world(*motions, radii_m=None, vehicle=None, physics_hz=240, start_enu=(0.0, 0.0, 5.0), start_yaw_rad=0.0):
     radii = [0.2] * len(motions) if radii_m is None else radii_m
     return World(
-        Crazyflie() if vehicle is None else vehicle,
+        [Crazyflie() if vehicle is None else vehicle],
         motions,
         radii_m=radii,
         physics_hz=physics_hz,
-        start_enu=start_enu,
-        start_yaw_rad=start_yaw_rad,
+        starts=[Start(start_enu, start_yaw_rad)],
     )
 
 
@@ -47,12 +46,12 @@ def test_table_2():
 def test_motors_off_falls_at_g():
     with world() as w:
         for _ in range(120):
-            w.step(OFF)
+            w.step([OFF])
         n, dt = 120, 1.0 / 240.0
-        assert w.state.v_enu == pytest.approx((0.0, 0.0, -9.8 * n * dt), abs=1e-9)
+        assert w.states[0].v_enu == pytest.approx((0.0, 0.0, -9.8 * n * dt), abs=1e-9)
         # semi-implicit Euler, as PyBullet integrates: z = -g dt^2 n (n + 1) / 2
-        assert w.state.p_enu[2] == pytest.approx(5.0 - 9.8 * dt * dt * n * (n + 1) / 2.0, abs=1e-9)
-        assert w.state.omega_flu == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+        assert w.states[0].p_enu[2] == pytest.approx(5.0 - 9.8 * dt * dt * n * (n + 1) / 2.0, abs=1e-9)
+        assert w.states[0].omega_flu == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
 
 
 @pytest.mark.parametrize("dead", range(4))
@@ -61,28 +60,28 @@ def test_one_motor_off_tumbles(dead):
     command = tuple(0.0 if rotor == dead else hover for rotor in range(4))
     with world(start_enu=(0.0, 0.0, 50.0)) as w:
         for _ in range(24):
-            w.step(command)
-        x, y, _ = w.vehicle.rotor_positions_flu[dead]
-        assert body_z(w.state)[:2] @ [x, y] > 0.0  # the dead rotor's side drops first
+            w.step([command])
+        x, y, _ = w.vehicles[0].rotor_positions_flu[dead]
+        assert body_z(w.states[0])[:2] @ [x, y] > 0.0  # the dead rotor's side drops first
         uprights = []
         for _ in range(216):
-            w.step(command)
-            uprights.append(body_z(w.state)[2])
+            w.step([command])
+            uprights.append(body_z(w.states[0])[2])
         assert min(uprights) < -0.5  # went over
-        assert w.state.v_enu[2] < -1.0
+        assert w.states[0].v_enu[2] < -1.0
 
 
 def test_hovers_at_14468_rpm():
     with world() as w:
         for _ in range(120):  # the rotors spin up meanwhile
-            w.step((14_468.0,) * 4)
-        v_before = w.state.v_enu
+            w.step([(14_468.0,) * 4])
+        v_before = w.states[0].v_enu
         for _ in range(240):
-            w.step((14_468.0,) * 4)
+            w.step([(14_468.0,) * 4])
         # the fall during spin-up is damped by rotor drag, 4 w k_z / m per second, and by nothing else
         drag_per_s = 4 * 14_468 * 2 * math.pi / 60 * 10.311e-7 / 0.027
-        assert w.state.v_enu[2] == pytest.approx(v_before[2] * math.exp(-drag_per_s), rel=0.01, abs=1e-3)
-        assert body_z(w.state)[2] == pytest.approx(1.0, abs=1e-12)
+        assert w.states[0].v_enu[2] == pytest.approx(v_before[2] * math.exp(-drag_per_s), rel=0.01, abs=1e-3)
+        assert body_z(w.states[0])[2] == pytest.approx(1.0, abs=1e-12)
 
 
 def newton_euler(vehicle, rpm, state, duration_s):
@@ -123,17 +122,17 @@ def test_agrees_with_independent_newton_euler(seed):
     rpm = 14_468.0 * rng.uniform(0.95, 1.05, 4)
     with world(vehicle=vehicle, physics_hz=physics_hz, start_yaw_rad=rng.uniform(-3.0, 3.0)) as w:
         for _ in range(physics_hz // 10):  # tilt, speed and rates first, so that every term matters
-            w.step(tuple(rpm))
-        expected = newton_euler(vehicle, rpm, w.state, 0.2)
+            w.step([tuple(rpm)])
+        expected = newton_euler(vehicle, rpm, w.states[0], 0.2)
         for _ in range(physics_hz // 5):
-            w.step(tuple(rpm))
-        assert abs(body_z(w.state)[2]) < 0.97  # it did tilt
-        assert w.state.p_enu == pytest.approx(expected[:3], abs=1e-3)
-        assert w.state.v_enu == pytest.approx(expected[3:6], abs=1e-2)
-        qw, qx, qy, qz = w.state.q_wxyz
+            w.step([tuple(rpm)])
+        assert abs(body_z(w.states[0])[2]) < 0.97  # it did tilt
+        assert w.states[0].p_enu == pytest.approx(expected[:3], abs=1e-3)
+        assert w.states[0].v_enu == pytest.approx(expected[3:6], abs=1e-2)
+        qw, qx, qy, qz = w.states[0].q_wxyz
         turn = Rotation.from_quat([qx, qy, qz, qw]) * Rotation.from_quat(expected[6:10]).inv()
         assert turn.magnitude() < 5e-3
-        assert w.state.omega_flu == pytest.approx(expected[10:], rel=5e-3, abs=5e-3)
+        assert w.states[0].omega_flu == pytest.approx(expected[10:], rel=5e-3, abs=5e-3)
 
 
 def test_drag_opposes_the_motion_of_the_body():
@@ -142,23 +141,23 @@ def test_drag_opposes_the_motion_of_the_body():
         world(start_enu=(0.0, 0.0, 100.0), vehicle=Crazyflie(drag_xy_kg_rad=0.0, drag_z_kg_rad=0.0)) as without,
     ):
         for _ in range(480):
-            w.step((13_000.0,) * 4)
-            without.step((13_000.0,) * 4)
-        assert without.state.v_enu[2] < w.state.v_enu[2] < 0.0
+            w.step([(13_000.0,) * 4])
+            without.step([(13_000.0,) * 4])
+        assert without.states[0].v_enu[2] < w.states[0].v_enu[2] < 0.0
 
 
 def test_motor_lag_is_first_order():
     with world() as w:
-        top = w.vehicle.max_rpm
+        top = w.vehicles[0].max_rpm
         for _ in range(3):  # 12.5 ms up
-            w.step((30_000.0,) * 4)
-        assert w.rotor_rpm == pytest.approx((top * (1.0 - math.exp(-1.0)),) * 4)
+            w.step([(30_000.0,) * 4])
+        assert w.bodies[0].rotor_rpm == pytest.approx((top * (1.0 - math.exp(-1.0)),) * 4)
         for _ in range(240):
-            w.step((30_000.0,) * 4)
-        assert w.rotor_rpm == pytest.approx((top,) * 4)  # a motor gives no more than it has
+            w.step([(30_000.0,) * 4])
+        assert w.bodies[0].rotor_rpm == pytest.approx((top,) * 4)  # a motor gives no more than it has
         for _ in range(6):  # 25 ms down
-            w.step((-5.0,) * 4)
-        assert w.rotor_rpm == pytest.approx((top * math.exp(-1.0),) * 4)
+            w.step([(-5.0,) * 4])
+        assert w.bodies[0].rotor_rpm == pytest.approx((top * math.exp(-1.0),) * 4)
 
 
 def test_closest_points_agree_with_the_formula():
@@ -171,17 +170,17 @@ def test_closest_points_agree_with_the_formula():
     radii_m = (0.2, 0.5, 0.1, 1.3)
     with world(*motions, radii_m=radii_m, start_enu=(0.0, 0.0, 1.0)) as w:
         w.start_motions()
-        controller = Controller(w.vehicle, 240)
+        controller = Controller(w.vehicles[0], 240)
         for _ in range(480):
-            w.step(controller.rpm(w.state, PositionSetpoint((1.0, 3.0, 2.5), 0.0)))
+            w.step([controller.rpm(w.states[0], PositionSetpoint((1.0, 3.0, 2.5), 0.0))])
             if w.step_count % 40:
                 continue
             expected = []
             for index, (motion, radius_m) in enumerate(zip(motions, radii_m, strict=True)):
-                distance = np.linalg.norm(np.subtract(w.state.p_enu, motion.position(w.t_s)))
+                distance = np.linalg.norm(np.subtract(w.states[0].p_enu, motion.position(w.t_s)))
                 expected.append(distance - 0.2 - radius_m)
                 assert w.closest_points_m(index) == pytest.approx(expected[-1], abs=1e-3)
-            assert w.clearance_m == pytest.approx(min(expected), abs=1e-12)
+            assert w.clearances_m[0] == pytest.approx(min(expected), abs=1e-12)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.05, 0.5, 3.0])
@@ -193,15 +192,15 @@ def test_no_contact_without_a_collision_seen(speed_m_s, who):
     drop_m = speed_m_s**2 / (2 * 9.8) if who == "vehicle" else 0.01
     with world(hit, start_enu=(0.0, 0.0, 1.4 + drop_m)) as w:
         w.start_motions()
-        controller = Controller(w.vehicle, 240)
-        hold = PositionSetpoint(w.state.p_enu)
+        controller = Controller(w.vehicles[0], 240)
+        hold = PositionSetpoint(w.states[0].p_enu)
         for _ in range(240):
-            w.step(OFF if who == "vehicle" else controller.rpm(w.state, hold))
-            if w.clearance_m <= 0.0:
+            w.step([OFF if who == "vehicle" else controller.rpm(w.states[0], hold)])
+            if w.clearances_m[0] <= 0.0:
                 break
-            contacts = pybullet.getContactPoints(w._body, w._spheres[0], physicsClientId=w._client)
+            contacts = pybullet.getContactPoints(w.bodies[0].number, w._spheres[0], physicsClientId=w._client)
             assert all(contact[9] == 0.0 for contact in contacts)  # normal force
-        assert w.min_clearance_m <= 0.0
+        assert w.min_clearances_m[0] <= 0.0
 
 
 def test_flight_sets_no_pose_or_velocity_of_the_vehicle(monkeypatch):
@@ -223,25 +222,25 @@ def test_flight_sets_no_pose_or_velocity_of_the_vehicle(monkeypatch):
         assert "resetBaseVelocity" in names
         for name in names:
             monkeypatch.setattr(pybullet, name, recorder(name))
-        controller = Controller(w.vehicle, 240)
+        controller = Controller(w.vehicles[0], 240)
         w.start_motions()
         for _ in range(240):
-            w.step(controller.rpm(w.state, PositionSetpoint((0.5, 0.5, 1.0))))
-        assert w.state.p_enu[2] > 0.5
+            w.step([controller.rpm(w.states[0], PositionSetpoint((0.5, 0.5, 1.0)))])
+        assert w.states[0].p_enu[2] > 0.5
         assert {body for _, body in placed} == {w._spheres[0]}
 
 
 def test_same_inputs_give_bit_equal_states():
     def fly():
         with world(FigureEight((1.0, 0.0, 1.0), 1.0, 4.0), Static((1.2, 0.2, 0.9)), start_enu=(0.0, 0.0, 0.2)) as w:
-            controller = Controller(w.vehicle, 240)
+            controller = Controller(w.vehicles[0], 240)
             states = []
             for step in range(720):
                 if step == 100:
                     w.start_motions()
-                w.step(controller.rpm(w.state, PositionSetpoint((2.0, 0.3, 1.0), 0.5)))
-                states.append((w.state, w.clearance_m))
-            assert w.min_clearance_m < 0.0  # contacts included
+                w.step([controller.rpm(w.states[0], PositionSetpoint((2.0, 0.3, 1.0), 0.5))])
+                states.append((w.states[0], w.clearances_m[0]))
+            assert w.min_clearances_m[0] < 0.0  # contacts included
             return states
 
     assert fly() == fly()
@@ -250,64 +249,64 @@ def test_same_inputs_give_bit_equal_states():
 def test_worlds_in_one_process_do_not_touch_each_other():
     with world() as alone:
         for _ in range(50):
-            alone.step((15_000.0, 14_000.0, 14_500.0, 14_468.0))
-        expected = alone.state
+            alone.step([(15_000.0, 14_000.0, 14_500.0, 14_468.0)])
+        expected = alone.states[0]
     with world() as first, world(Static((0.0, 0.0, 4.7))) as second:
         for _ in range(50):
-            first.step((15_000.0, 14_000.0, 14_500.0, 14_468.0))
-            second.step(OFF)
-        assert first.state == expected
-        assert first.clearance_m == math.inf
+            first.step([(15_000.0, 14_000.0, 14_500.0, 14_468.0)])
+            second.step([OFF])
+        assert first.states[0] == expected
+        assert first.clearances_m[0] == math.inf
 
 
 def test_obstacles_wait_until_their_clock_starts():
     motion = Linear((5.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     with world(motion) as w:
         for _ in range(120):
-            w.step(OFF)
+            w.step([OFF])
         assert w.obstacle_positions(w.t_s) == [(5.0, 0.0, 1.0)]
         assert w.obstacle_velocities(w.t_s) == [(0.0, 0.0, 0.0)]
         w.start_motions()
         for _ in range(120):
-            w.step(OFF)
+            w.step([OFF])
         assert w.t_s == 1.0
         assert w.obstacle_positions(w.t_s) == [(5.5, 0.0, 1.0)]
         assert w.obstacle_positions(0.75) == [(5.25, 0.0, 1.0)]
         assert w.obstacle_positions(0.2) == [(5.0, 0.0, 1.0)]
         assert w.obstacle_velocities(w.t_s) == [(1.0, 0.0, 0.0)]
-        assert w.closest_points_m(0) == pytest.approx(math.dist(w.state.p_enu, (5.5, 0.0, 1.0)) - 0.4, abs=1e-3)
+        assert w.closest_points_m(0) == pytest.approx(math.dist(w.states[0].p_enu, (5.5, 0.0, 1.0)) - 0.4, abs=1e-3)
 
 
 def test_least_clearance_is_remembered_until_reset():
     with world(Linear((0.0, 0.0, 3.0), (0.0, 0.0, -20.0)), start_enu=(0.0, 0.0, 5.0)) as w:
-        before = w.clearance_m
+        before = w.clearances_m[0]
         assert before == pytest.approx(1.6)
         w.start_motions()
         for _ in range(48):
-            w.step((14_468.0,) * 4)
-        assert w.clearance_m > before
-        assert w.min_clearance_m == pytest.approx(before)
+            w.step([(14_468.0,) * 4])
+        assert w.clearances_m[0] > before
+        assert w.min_clearances_m[0] == pytest.approx(before)
         w.reset_min_clearance()
-        assert w.min_clearance_m == w.clearance_m
+        assert w.min_clearances_m[0] == w.clearances_m[0]
 
 
 def test_falls_to_the_ground_and_rests_there():
     with world(start_enu=(0.0, 0.0, 0.5)) as w:
-        assert not w.on_ground
-        assert not w.touched_ground
+        assert not w.bodies[0].on_ground
+        assert not w.touched_ground[0]
         for _ in range(480):
-            w.step(OFF)
-        assert w.on_ground
-        assert w.touched_ground
-        assert w.state.p_enu == pytest.approx((0.0, 0.0, 0.2), abs=1e-3)
-        assert w.state.v_enu == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
-        controller = Controller(w.vehicle, 240)
+            w.step([OFF])
+        assert w.bodies[0].on_ground
+        assert w.touched_ground[0]
+        assert w.states[0].p_enu == pytest.approx((0.0, 0.0, 0.2), abs=1e-3)
+        assert w.states[0].v_enu == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+        controller = Controller(w.vehicles[0], 240)
         for _ in range(480):
-            w.step(controller.rpm(w.state, PositionSetpoint((0.0, 0.0, 1.0))))
-        assert not w.on_ground
-        assert w.touched_ground
+            w.step([controller.rpm(w.states[0], PositionSetpoint((0.0, 0.0, 1.0)))])
+        assert not w.bodies[0].on_ground
+        assert w.touched_ground[0]
         w.reset_min_clearance()
-        assert not w.touched_ground
+        assert not w.touched_ground[0]
 
 
 def test_rates():
@@ -324,7 +323,7 @@ def test_rates():
 def test_bad_worlds_are_refused_in_one_line():
     with pytest.raises(ScenarioError, match=r"^radii_m: expected 1 values, one for each motion, got 0$"):
         world(Static((0.0, 0.0, 1.0)), radii_m=[])
-    with pytest.raises(ScenarioError, match=r"^start_enu: expected z at least the radius 0.2 m, got 0.1$"):
+    with pytest.raises(ScenarioError, match=r"^start: expected z at least the radius 0.2 m, got 0.1$"):
         world(start_enu=(0.0, 0.0, 0.1))
     with pytest.raises(ScenarioError, match=r"^physics_hz: expected"):
         world(physics_hz=0)
