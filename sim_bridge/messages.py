@@ -187,6 +187,7 @@ class MissionRequest:
 
     message_id: int
     mission_type: int
+    items: int  # announced by MISSION_COUNT
     sender: Sender
 
 

@@ -17,6 +17,7 @@ from sim_bridge.messages import (
     LinkName,
     LocalSetpoint,
     Reply,
+    Result,
     Sticks,
     Vec3,
 )
@@ -53,14 +54,25 @@ class ParameterTable(Protocol):
     def write(self, name: str, value: float | int, *, is_int: bool) -> bool:
         """Set a known parameter; False (and unchanged) for a wrong type or a value out of range."""
 
+    def checksum(self) -> int | None:
+        """What a request for ``_HASH_CHECK`` answers, None: nothing."""
+
 
 class Personality(Protocol):
     """One vehicle's autopilot."""
 
     kind: int  # MAV_AUTOPILOT
-    armed: bool
-    landed: Landed
-    home_enu: Vec3
+    unknown_stream: Result  # of a SET_MESSAGE_INTERVAL for a message that does not exist here
+    too_fast_stream: Result  # and of one faster than `max_rate_hz`; ACCEPTED: it comes as fast as it can
+
+    @property
+    def armed(self) -> bool: ...
+
+    @property
+    def landed(self) -> Landed: ...
+
+    @property
+    def home_enu(self) -> Vec3: ...
 
     @property
     def custom_mode(self) -> int:
@@ -100,6 +112,14 @@ class Personality(Protocol):
     def max_rate_hz(self) -> float:
         """The fastest stream that can be asked for."""
 
+    @property
+    def health(self) -> tuple[int, int, int]:
+        """SYS_STATUS's MAV_SYS_STATUS_SENSOR masks: present, enabled, healthy."""
+
+    @property
+    def charge_state(self) -> int:
+        """MAV_BATTERY_CHARGE_STATE."""
+
     def rates_hz(self, link: LinkName) -> Mapping[int, float]:
         """What streams unasked on ``link``: message id to rate."""
 
@@ -138,3 +158,6 @@ class Personality(Protocol):
 
     def position_target(self) -> LocalSetpoint | None:
         """POSITION_TARGET_LOCAL_NED: what is flown, in the form of a setpoint; None: nothing to tell."""
+
+    def attitude_target(self) -> AttitudeTarget | None:
+        """ATTITUDE_TARGET: the attitude or rates that are flown; None where the position loops fly."""

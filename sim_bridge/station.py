@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Protocol
 
@@ -13,28 +14,34 @@ from sim_bridge.messages import (
     Cmd,
     Command,
     LocalSetpoint,
+    MissionRequest,
     ParamRead,
     ParamWrite,
+    Ping,
     Reply,
     Result,
     StationHeartbeat,
     Sticks,
     Text,
     Timesync,
+    Vec3,
 )
-from sim_bridge.personality import Personality
+from sim_bridge.personality import BatteryReading, Personality
 from sim_bridge.physics import BodyState
+from sim_bridge.reports import Moment
 from sim_bridge.telemetry import (
     ATTITUDE_QUATERNION,
+    AUTOPILOT_VERSION,
     BUILDERS,
     EXTENDED_SYS_STATE,
     HEARTBEAT,
+    HOME_POSITION,
     LOCAL_POSITION_NED,
-    Moment,
     Streams,
     build,
 )
 
+_HASH_CHECK = "_HASH_CHECK"
 _LOCKSTEP_PINNED = frozenset({HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED})
 
 
@@ -47,6 +54,13 @@ class Vehicle(Protocol):
     @property
     def state(self) -> BodyState:
         """What its estimator believes."""
+
+    @property
+    def accuracy(self) -> tuple[float, float, float]:
+        """Standard deviations of position [m], velocity [m/s] and attitude [rad]."""
+
+    @property
+    def battery(self) -> BatteryReading: ...
 
 
 class Station:
@@ -100,6 +114,10 @@ class Station:
             replies = self._command(link, content)
         elif isinstance(content, Timesync):
             link.send(link.encoder.timesync(content, self._clock_ns()))
+        elif isinstance(content, Ping):
+            link.send(link.encoder.ping(content))
+        elif isinstance(content, MissionRequest):
+            link.send(link.encoder.no_mission(content))
         elif isinstance(content, ParamRead):
             self._read_parameters(link, content)
         else:
@@ -118,7 +136,7 @@ class Station:
                 link.send(link.encoder.ack(reply))
 
     def announce(self) -> None:
-        """At once: a heartbeat at a change of mode or arming, EXTENDED_SYS_STATE at a change of landed state."""
+        """At once what changed: HEARTBEAT (mode, arming), EXTENDED_SYS_STATE (landed), HOME_POSITION."""
         status = self._status()
         if status == self._announced:
             return
@@ -126,6 +144,8 @@ class Station:
             self.send(HEARTBEAT)
         if status[2] != self._announced[2]:
             self.send(EXTENDED_SYS_STATE)
+        if status[3] != self._announced[3]:
+            self.send(HOME_POSITION)
         self._announced = status
 
     def stream(self, *links: Link) -> None:
@@ -153,17 +173,26 @@ class Station:
         link.send(build(message_id, now, link.encoder))
 
     def _moment(self) -> Moment:
-        return Moment(self._t_ns(), self._vehicle.state, self._autopilot, self._router.id.system)
+        vehicle = self._vehicle
+        system = self._router.id.system
+        return Moment(self._t_ns(), vehicle.state, self._autopilot, vehicle.battery, vehicle.accuracy, system)
 
-    def _status(self) -> tuple[int, bool, int]:
+    def _status(self) -> tuple[int, bool, int, Vec3]:
         autopilot = self._autopilot
-        return (autopilot.custom_mode, autopilot.armed, int(autopilot.landed))
+        return (autopilot.custom_mode, autopilot.armed, int(autopilot.landed), autopilot.home_enu)
 
     def _command(self, link: Link, command: Command) -> tuple[Reply, ...]:
         streams = self._streams[link]
         message_id = int(command.params[0]) if abs(command.params[0]) < 1 << 24 else -1
         if command.command == Cmd.SET_MESSAGE_INTERVAL:
-            granted = streams.request(message_id, command.params[1], self._t_ns())
+            result = self._set_interval(streams, message_id, command.params[1])
+            return (Ack(command.command, result, command.sender),)
+        if command.command == Cmd.REQUEST_PROTOCOL_VERSION:
+            link.send(link.encoder.protocol_version())
+            granted = True
+        elif command.command == Cmd.REQUEST_AUTOPILOT_CAPABILITIES:
+            self._send_one(link, AUTOPILOT_VERSION, self._moment())
+            granted = True
         elif command.command == Cmd.GET_MESSAGE_INTERVAL:
             link.send(link.encoder.message_interval(message_id & 0xFFFF, streams.interval_us(message_id)))
             granted = message_id in BUILDERS
@@ -175,8 +204,23 @@ class Station:
             return self._autopilot.command(command, self._vehicle.state, self._t_ns())
         return (Ack(command.command, Result.ACCEPTED if granted else Result.DENIED, command.sender),)
 
+    def _set_interval(self, streams: Streams, message_id: int, interval_us: float) -> Result:
+        """Microseconds, -1 off, 0 the default; what is faster than the vehicle may be granted as fast as it goes."""
+        if message_id not in BUILDERS or not math.isfinite(interval_us):
+            return self._autopilot.unknown_stream
+        if streams.too_fast(interval_us):
+            if self._autopilot.too_fast_stream is not Result.ACCEPTED:
+                return self._autopilot.too_fast_stream
+            interval_us = streams.least_us
+        streams.request(message_id, interval_us, self._t_ns())
+        return Result.ACCEPTED
+
     def _read_parameters(self, link: Link, wanted: ParamRead) -> None:
         known = self._autopilot.parameters.names
+        if wanted.name == _HASH_CHECK or (not wanted.name and wanted.index < 0):
+            checksum = self._autopilot.parameters.checksum()
+            if checksum is not None:
+                link.send(link.encoder.param_checksum(checksum, len(known)))
         if wanted.name:
             names: tuple[str, ...] = (wanted.name,) if wanted.name in known else ()
         elif wanted.index >= 0:

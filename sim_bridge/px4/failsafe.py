@@ -182,9 +182,9 @@ class Failsafe:
         worst = max((active.reaction for active in self._active.values()), key=lambda r: r.action)
         allowed = max(active.reaction.takeover for active in self._active.values())
         action, delayed = worst.action, Action.NONE
-        if self._delay_s > 0.0 and not taken_over and allowed <= Takeover.MODE_SWITCH and action > Action.WARN:
-            if action not in (Action.DISARM, Action.TERMINATE):
-                action, delayed, allowed = Action.HOLD, action, Takeover.MODE_SWITCH
+        delays = self._delay_s > 0.0 and not taken_over and allowed <= Takeover.MODE_SWITCH
+        if delays and Action.WARN < action < Action.DISARM:
+            action, delayed, allowed = Action.HOLD, action, Takeover.MODE_SWITCH
         switched = changed and before.action is action
         by_sticks = sticks and not taken_over and allowed is Takeover.ALWAYS
         takes = taken_over or switched or by_sticks

@@ -75,7 +75,7 @@ class Navigator:
         self._aim(PositionSetpoint(below, self.yaw_rad, float(self._parameters["MPC_LAND_SPEED"])))
 
     def go_home(self, state: BodyState, home_enu: Vec3) -> None:
-        x, y, z = state.p_enu
+        x, y, _ = state.p_enu
         self._aim(PositionSetpoint((x, y, self.return_z_m(state.p_enu, home_enu)), self.yaw_rad), limited=True)
         self.phase = Phase.CLIMB
 

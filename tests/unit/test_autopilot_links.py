@@ -55,7 +55,7 @@ class Bench:
         self.companion, self.ground = Peer(1, 196), Peer(245, 190)
         self.flight = Flight(resolve("bench", parse_scenario(AIRBORNE, source="bench"), 0))
         self.router = Router(self.companion.port, self.ground.port)
-        self.station = Station(self.flight, self.router, t_ns=self.t_ns, clock_ns=self.t_ns, lockstep=False)
+        self.station = Station(self.flight.crafts[0], self.router, t_ns=self.t_ns, clock_ns=self.t_ns, lockstep=False)
         self.onboard_link, self.ground_link = self.router.links
         self.station.stream(*self.router.links)
 
