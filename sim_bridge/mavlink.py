@@ -302,7 +302,7 @@ class Encoder:
 
     def protocol_version(self) -> bytes:
         """PROTOCOL_VERSION (300), which pymavlink's dialect lacks: 2.0, from 1.0 to 2.0, without hashes."""
-        payload = struct.pack("<HHH", 200, 100, 200)  # MAVLink 2 cuts the hashes' zeros
+        payload = struct.pack("<HHH", 200, 100, 200).rstrip(b"\0")  # MAVLink 2 cuts zeros, those of the hashes too
         head = struct.pack("<BBBBBB", len(payload), 0, 0, self._mav.seq, self._mav.srcSystem, self._mav.srcComponent)
         body = head + _PROTOCOL_VERSION.to_bytes(3, "little") + payload
         crc = dialect.x25crc(body)

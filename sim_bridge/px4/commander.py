@@ -231,6 +231,8 @@ class Commander:
         return bool(int(self.parameters["COM_RC_OVERRIDE"]) & bit) and self._sticks.moved()
 
     def _watch_failsafe(self, state: BodyState, t_ns: int) -> list[Reply]:
+        if not self._sticks.lost(t_ns):
+            self._sticks_lost_at_arming = False  # from now on they are missed
         now = self.situation(state, t_ns)
         before = self._failsafe.verdict
 
