@@ -74,7 +74,7 @@ class Autopilot:
     capabilities = 2 | 8 | 16 | 64 | 128 | 256 | 2048 | 8192
     version = 1 << 24 | 15 << 16 | 255  # 1.15.0, release
     unknown_stream = Result.FAILED
-    too_fast_stream = Result.ACCEPTED  # as fast as the physics then
+    too_fast_stream = Result.DENIED  # PX4 grants what its link cannot carry; here it is said
 
     def __init__(
         self,

@@ -19,6 +19,7 @@ Message: TypeAlias = Any  # dialect.MAVLink_message, or None: nothing to tell; p
 
 _UNKNOWN = 65535
 _FRAME_LOCAL_NED, _FRAME_BODY_FRD = 1, 12
+_LEAST_STD = 1e-3  # no estimator is certain: a variance of 0 would be taken for unknown
 _AUTOPILOT_ESTIMATOR = 8  # MAV_ESTIMATOR_TYPE_AUTOPILOT
 
 
@@ -32,6 +33,8 @@ class Moment:
     battery: BatteryReading
     accuracy: tuple[float, float, float]  # standard deviations: position [m], velocity [m/s], attitude [rad]
     system: int = 1
+    throttle: float = 0.0  # collective, share of full thrust
+    unix_ns: int = 0  # 0: not known
 
     @property
     def t_ms(self) -> int:
@@ -84,7 +87,7 @@ def odometry(now: Moment) -> Message:
     if not now.has_position:
         return None
     state = now.state
-    position, velocity, attitude = (std * std for std in now.accuracy)
+    position, velocity, attitude = (max(std, _LEAST_STD) ** 2 for std in now.accuracy)
     pose = _diagonal((position,) * 3 + (attitude,) * 3)
     twist = _diagonal((velocity,) * 3 + (0.0,) * 3)
     return dialect.MAVLink_odometry_message(
@@ -108,7 +111,7 @@ def extended_sys_state(now: Moment) -> Message:
 
 
 def system_time(now: Moment) -> Message:
-    return dialect.MAVLink_system_time_message(0, now.t_ms)  # no UTC here
+    return dialect.MAVLink_system_time_message(now.unix_ns // 1000, now.t_ms)
 
 
 def sys_status(now: Moment) -> Message:
@@ -194,7 +197,7 @@ def vfr_hud(now: Moment) -> Message:
         math.hypot(vx, vy, vz),
         math.hypot(vx, vy),
         heading_deg,
-        0,  # throttle: not measured
+        round(100.0 * now.throttle),
         HOME_ALTITUDE_AMSL_M + now.state.p_enu[2],
         vz,
     )

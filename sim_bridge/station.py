@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from typing import Protocol
 
@@ -62,6 +63,10 @@ class Vehicle(Protocol):
     @property
     def battery(self) -> BatteryReading: ...
 
+    @property
+    def throttle(self) -> float:
+        """Collective, share of full thrust."""
+
 
 class Station:
     """What the two links see of one vehicle.
@@ -86,6 +91,8 @@ class Station:
         self._router = router
         self._t_ns = t_ns
         self._clock_ns = clock_ns
+        # UTC as a receiver of satellites would know it; in lockstep there is none
+        self._unix_start_ns = 0 if lockstep else time.time_ns() - t_ns()
         self._streams = {
             link: Streams(
                 self._autopilot.rates_hz(link.name),
@@ -175,7 +182,18 @@ class Station:
     def _moment(self) -> Moment:
         vehicle = self._vehicle
         system = self._router.id.system
-        return Moment(self._t_ns(), vehicle.state, self._autopilot, vehicle.battery, vehicle.accuracy, system)
+        t_ns = self._t_ns()
+        unix_ns = self._unix_start_ns and self._unix_start_ns + t_ns
+        return Moment(
+            t_ns,
+            vehicle.state,
+            self._autopilot,
+            vehicle.battery,
+            vehicle.accuracy,
+            system,
+            vehicle.throttle,
+            unix_ns,
+        )
 
     def _status(self) -> tuple[int, bool, int, Vec3]:
         autopilot = self._autopilot

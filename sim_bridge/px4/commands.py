@@ -111,6 +111,8 @@ class Commands:
         mode = next((m for m in _REQUESTABLE if m == number), None)
         if mode is None:
             return Result.TEMPORARILY_REJECTED, [f"Mode {int(main)}/{int(sub)} denied: not available here"]
+        if mode is Mode.HOLD is self._commander.mode and self._navigator.goes:
+            self._navigator.hold(state.p_enu)  # on its way somewhere: stop here
         return self._change(mode, state, t_ns)
 
     def _reposition(self, command: Command, state: BodyState, t_ns: int) -> Answer:

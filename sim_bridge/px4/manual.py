@@ -13,7 +13,7 @@ from sim_bridge.controller import AttitudeSetpoint
 from sim_bridge.messages import Mode, Vec3
 from sim_bridge.personality import ParameterTable
 from sim_bridge.physics import BodyState
-from sim_bridge.px4.position import FREE, PositionControl, Trajectory
+from sim_bridge.px4.position import PositionControl, Trajectory
 from sim_bridge.px4.sticks import ManualControl
 from sim_bridge.rotation import from_euler
 
@@ -32,9 +32,10 @@ class ManualFlight:
         self._lock_enu: Vec3 | None = None  # horizontally where the sticks were centred
         self._lock_z_m: float | None = None
         self._wanted: Vec3 = (0.0, 0.0, 0.0)
+        self._a_enu: Vec3 = (0.0, 0.0, 0.0)  # of the velocity asked for
 
     def enter(self, state: BodyState) -> None:
-        self._v_enu = state.v_enu
+        self._v_enu, self._a_enu = state.v_enu, (0.0, 0.0, 0.0)
         self._lock_enu = self._lock_z_m = None
         self._control.reset()
 
@@ -48,7 +49,7 @@ class ManualFlight:
             self._lock_enu = state.p_enu
         lock = self._lock_enu
         level = (math.nan, math.nan) if lock is None else (lock[0], lock[1])
-        return Trajectory((*level, self._height(state, wanted[2])), (vx, vy, wanted[2]), FREE, yaw_rad)
+        return Trajectory((*level, self._height(state, wanted[2])), (vx, vy, wanted[2]), self._a_enu, yaw_rad)
 
     def attitude(self, mode: Mode, state: BodyState, yaw_rad: float) -> AttitudeSetpoint:
         """Altitude and Stabilized mode."""
@@ -69,6 +70,7 @@ class ManualFlight:
         dx, dy = self._wanted[0] - self._v_enu[0], self._wanted[1] - self._v_enu[1]
         length = math.hypot(dx, dy)
         share = 1.0 if length <= most else most / length
+        self._a_enu = (share * dx / dt_s, share * dy / dt_s, 0.0)
         self._v_enu = (self._v_enu[0] + share * dx, self._v_enu[1] + share * dy, self._wanted[2])
 
     def _height(self, state: BodyState, climb_m_s: float) -> float:

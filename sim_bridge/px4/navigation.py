@@ -99,6 +99,11 @@ class Navigator:
         self.goal, self.phase, self._limited, self._near_since_ns = goal, None, limited, None
 
     @property
+    def goes(self) -> bool:
+        """On its way, not holding a place."""
+        return self.goal is not None and self._limited
+
+    @property
     def descends(self) -> bool:
         """Its goal is the ground."""
         return self.goal is None or self.goal.p_enu[2] < self._rest_z_m

@@ -21,6 +21,7 @@ _GROUND_HZ: dict[int, float] = {
     33: 5.0,  # GLOBAL_POSITION_INT
     74: 4.0,  # VFR_HUD
     141: 1.0,  # ALTITUDE
+    331: 5.0,  # ODOMETRY
     2: 1.0,  # SYSTEM_TIME
 }
 
