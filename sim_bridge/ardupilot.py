@@ -17,9 +17,10 @@ from sim_bridge.ardupilot_failsafe import LANDING_CONTINUES, PILOT_CONTINUES, Ac
 from sim_bridge.ardupilot_guided import Submode
 from sim_bridge.ardupilot_parameters import ArduParameters
 from sim_bridge.ardupilot_plans import ArduMode
+from sim_bridge.ardupilot_telemetry import LOOP_RATE_HZ, STREAMS, health, rates_hz
 from sim_bridge.controller import Setpoint
 from sim_bridge.messages import (
-    FORCE_DISARM,
+    FORCE,
     NS_PER_S,
     Ack,
     AttitudeTarget,
@@ -42,16 +43,6 @@ REBOOT_NS = 1_200_000_000  # from the command to the first heartbeat
 PREARM_NS = 30 * NS_PER_S  # between the reasons that it tells by itself
 FORCE_ARM = 2989.0  # param2 of COMPONENT_ARM_DISARM
 
-_HEARTBEAT, _ATTITUDE_QUATERNION, _LOCAL_POSITION_NED = 0, 31, 32
-_LOOP_RATE_HZ = 320.0  # the fastest stream: 0.8 of its main loop
-_STREAMS: Mapping[int, tuple[int, ...]] = {  # MAV_DATA_STREAM
-    0: (1, 24, 30, 31, 32, 33, 74, 147),
-    2: (1, 24),
-    6: (32, 33),
-    10: (30,),
-    11: (74,),
-    12: (147,),
-}
 _NEED_POSITION = (ArduMode.LOITER, ArduMode.RTL, ArduMode.BRAKE)
 _ACTIONS = {Action.RTL: ArduMode.RTL, Action.LAND: ArduMode.LAND, Action.BRAKE: ArduMode.BRAKE}
 
@@ -65,18 +56,28 @@ class ArduCopter:
         yaw_rad: initial heading, counter-clockwise from east.
         control_hz: the rate of the state on the onboard link in lockstep.
         physics_hz: the fastest stream, unless its own loop is slower.
+        system_id: MAVLink system of the vehicle.
     """
 
     kind = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
-    # float parameters, COMMAND_INT, local setpoints, MAVLink 2, integers as plain floats (C_CAST)
-    capabilities = 2 | 8 | 128 | 8192 | 1 << 17
+    # float parameters, COMMAND_INT, local and global setpoints, MAVLink 2, integers as plain floats (C_CAST)
+    capabilities = 2 | 8 | 128 | 256 | 8192 | 1 << 17
     version = 4 << 24 | 7 << 16  # 4.7.0-dev
+    unknown_stream = Result.FAILED
+    too_fast_stream = Result.DENIED
 
     def __init__(
-        self, *, start_enu: Vec3, rest_height_m: float, yaw_rad: float, control_hz: int = 20, physics_hz: int = 240
+        self,
+        *,
+        start_enu: Vec3,
+        rest_height_m: float,
+        yaw_rad: float,
+        control_hz: int = 20,
+        physics_hz: int = 240,
+        system_id: int = 1,
     ) -> None:
-        self.parameters = ArduParameters()
-        self.max_rate_hz = min(float(physics_hz), _LOOP_RATE_HZ)
+        self.parameters = ArduParameters(system_id)
+        self.max_rate_hz = min(float(physics_hz), LOOP_RATE_HZ)
         self.lockstep = False
         self.up_since_ns = 0
         self._copter = Copter(start_enu, yaw_rad, rest_height_m, self.parameters)
@@ -148,15 +149,24 @@ class ArduCopter:
         since_ns = self._copter.t_ns - self.up_since_ns
         return self._born_airborne or self.lockstep or since_ns >= self.parameters["SIM_EKF_READY"] * NS_PER_S
 
+    @property
+    def health(self) -> tuple[int, int, int]:
+        return health(position_valid=self.position_valid, can_arm=self.armed or not self._arming_reasons())
+
+    @property
+    def charge_state(self) -> int:
+        """MAV_BATTERY_CHARGE_STATE: 1 fine, 2 low, 3 critical."""
+        return 1 + self._failsafes.battery_level
+
+    def attitude_target(self) -> AttitudeTarget | None:
+        """Never: attitude setpoints are left out."""
+        return None
+
     def rates_hz(self, link: LinkName) -> Mapping[int, float]:
-        """Heartbeats only; in lockstep also the state that the companion answers."""
-        if self.lockstep and link is LinkName.ONBOARD:
-            return {_HEARTBEAT: 1.0, _ATTITUDE_QUATERNION: self._control_hz, _LOCAL_POSITION_NED: self._control_hz}
-        return {_HEARTBEAT: 1.0}
+        return rates_hz(self._control_hz if self.lockstep and link is LinkName.ONBOARD else None)
 
     def stream_group(self, stream: int) -> tuple[int, ...]:
-        """Messages of a MAV_DATA_STREAM."""
-        return _STREAMS.get(stream, ())
+        return STREAMS.get(stream, ())
 
     def position_target(self) -> LocalSetpoint | None:
         if self.mode is not ArduMode.GUIDED:
@@ -185,7 +195,7 @@ class ArduCopter:
             return ()
         copter.t_ns = t_ns
         before = guided.submode
-        finite = guided.take(setpoint, copter.state.p_enu, copter.nose, t_ns)
+        finite = guided.take(setpoint, copter.state.p_enu, self.home_enu[2], copter.nose, t_ns)
         goes = guided.submode in (Submode.POSITION, Submode.POSITION_VELOCITY)
         if goes and self._failsafes.outside(guided.p_enu, self.home_enu):
             guided.stop()
@@ -205,7 +215,7 @@ class ArduCopter:
         """The sticks of the ground station that SYSID_MYGCS names; they fly the piloted modes."""
         if sticks.sender.system == self.parameters["SYSID_MYGCS"]:
             self._copter.t_ns = t_ns
-            self._copter.give(sticks)
+            self._copter.give(None if sticks.released else sticks)
         return ()
 
     def heard_station(self, t_ns: int, system: int = 255) -> None:
@@ -250,7 +260,7 @@ class ArduCopter:
 
     def _arm_disarm(self, command: Command) -> tuple[Result, str]:
         if command.params[0] < 0.5:
-            if self.armed and self.airborne and command.params[1] != FORCE_DISARM:
+            if self.armed and self.airborne and command.params[1] != FORCE:
                 return Result.FAILED, ""  # as the real one: not a word
             self._copter.disarm()
             return Result.ACCEPTED, ""
@@ -310,7 +320,7 @@ class ArduCopter:
             return Result.DENIED, "Reboot denied: in lockstep"
         self.up_since_ns = self._copter.t_ns + REBOOT_NS
         self._born_airborne = self._ekf_told = False
-        self._copter.drop_sticks()
+        self._copter.give(None)
         self._failsafes = Failsafes(self.parameters)
         self._copter.enter(ArduMode.STABILIZE)
         return Result.ACCEPTED, ""

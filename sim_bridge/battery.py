@@ -11,14 +11,16 @@ Sources
     Bitcraze, "PWM to thrust", Crazyflie 2.0 on a scale (16 points of current, voltage, duty and thrust): a straight
         line through P = V I gives c_p = 24.0 W/N and P_e = 1.07 W (largest residue 0.16 W), one through V(I) gives
         R = 0.163 ohm (27 mV; the cell discharged meanwhile, so R is an upper bound).
+        Voltage times duty is the motors' voltage; at full duty they see all of the terminals': `MOTOR_V` to `MOTOR_G`,
+        the last pair extrapolated to the 60 g at which the firmware (``motors.c``) puts full thrust. The same firmware
+        compensates the voltage, so that below full duty thrust does not sag.
     Bitcraze firmware ``pm_stm32f4.c``: discharge curve of the battery 671723HS25C in steps of 10 %; 4.2 V when charged.
-    Bitcraze firmware ``motors.c``: motor voltage for a thrust in grams, U_m = 0.088 t - 0.0006239 t^2; 60 g at full
-        thrust, hence at 3.03 V. (The same firmware compensates the voltage: below full duty thrust does not sag.)
-    250 mAh: Bitcraze, Crazyflie 2.1 data sheet.
+    250 mAh: the stock cell of the Crazyflie 2.1.
 """
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -28,10 +30,9 @@ RESISTANCE_OHM = 0.163
 ELECTRONICS_W = 1.07
 WATT_PER_NEWTON = 24.0
 OPEN_CIRCUIT_V = (3.00, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10, 4.20)  # at 0, 10, ... 100 % of charge
-RATED_GRAMS = 60.0  # all four motors at full thrust
-
-_LINEAR_V_G, _SQUARE_V_G2 = 0.088, 0.0006239
-RATED_V = _LINEAR_V_G * RATED_GRAMS - _SQUARE_V_G2 * RATED_GRAMS**2  # at full duty, 3.03 V
+MOTOR_V = (0.0, 0.249, 0.494, 0.735, 0.970, 1.200, 1.425, 1.626, 1.855, 2.064, 2.281, 2.489, 2.670, 2.828, 2.975, 3.094)
+MOTOR_G = (0.0, 1.6, 4.8, 7.9, 10.9, 13.9, 17.3, 21.0, 24.4, 28.6, 32.8, 37.3, 41.7, 46.0, 51.9, 57.9)  # all four
+RATED_G, RATED_V = 60.0, 3.136
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +99,14 @@ def loaded_voltage_v(open_v: float, power_w: float) -> float:
 
 
 def available_share(voltage_v: float) -> float:
-    """Share of the rated thrust at full duty and ``voltage_v``: the firmware's curve, inverted.
+    """Share of the rated thrust at full duty and ``voltage_v``, linear between the measured points.
 
-    >>> available_share(3.6), round(available_share(2.8), 2)
-    (1.0, 0.81)
+    >>> available_share(3.6), round(available_share(2.67), 3)
+    (1.0, 0.695)
     """
     if voltage_v >= RATED_V:
         return 1.0
-    root = math.sqrt(_LINEAR_V_G * _LINEAR_V_G - 4.0 * _SQUARE_V_G2 * max(voltage_v, 0.0))
-    return (_LINEAR_V_G - root) / (2.0 * _SQUARE_V_G2) / RATED_GRAMS
+    above = bisect.bisect_right(MOTOR_V, max(voltage_v, 0.0))
+    high_v, high_g = (RATED_V, RATED_G) if above == len(MOTOR_V) else (MOTOR_V[above], MOTOR_G[above])
+    low_v, low_g = MOTOR_V[above - 1], MOTOR_G[above - 1]
+    return (low_g + (max(voltage_v, 0.0) - low_v) / (high_v - low_v) * (high_g - low_g)) / RATED_G

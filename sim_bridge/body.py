@@ -125,7 +125,7 @@ class Body:
         up, down, top = self._lag_up, self._lag_down, self._top_rpm
         speeds = []
         for rpm, command in zip(self.rotor_rpm, rpm_command, strict=True):
-            error = min(max(command, 0.0), top) - rpm
+            error = (0.0 if command < 0.0 else top if command > top else command) - rpm
             speeds.append(rpm + (up if error > 0.0 else down) * error)
         w0, w1, w2, w3 = speeds
         return (w0, w1, w2, w3)

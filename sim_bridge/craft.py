@@ -19,6 +19,7 @@ from sim_bridge.physics import BodyState, World
 from sim_bridge.scenario import End
 from sim_bridge.sensors import Frame, Sensor
 
+_NEVER_NS = 1 << 62
 _NEAR_M = 1.0  # closer than this, each obstacle's approach is looked at in every physics step, else in every period
 
 
@@ -67,6 +68,7 @@ class Craft:
         self._estimator = estimator
         self._belief = self.truth if estimator is None else estimator.update(self.truth)
         self._dt_s = 1.0 / world.physics_hz
+        self._sense_ns = 0  # when the next sensor measures
 
     @property
     def prefix(self) -> str:
@@ -89,6 +91,17 @@ class Craft:
         return self._belief
 
     @property
+    def accuracy(self) -> tuple[float, float, float]:
+        """Standard deviations of the believed position [m], velocity [m/s] and attitude [rad]; 0 for the truth."""
+        return (0.0, 0.0, 0.0) if self._estimator is None else self._estimator.std
+
+    @property
+    def throttle(self) -> float:
+        """Collective thrust, share of that of all rotors at full speed."""
+        body = self._world.bodies[self._index]
+        return sum(rpm * rpm for rpm in body.rotor_rpm) / (4.0 * body.vehicle.max_rpm**2)
+
+    @property
     def battery(self) -> BatteryState:
         return self._world.batteries[self._index].state
 
@@ -108,23 +121,25 @@ class Craft:
 
     def command(self) -> Quad:
         """Rotor speed commands for the coming physics step [RPM]."""
-        state = self.state
+        state = self._belief
         return self._controller.rpm(state, self.autopilot.target(state))
 
-    def follow(self, *, at_tick: bool) -> None:
-        """After a physics step: estimate, heading, sensors, judge."""
-        truth = self.truth
+    def follow(self, t_ns: int, *, at_tick: bool) -> None:
+        """After a physics step that ended at ``t_ns``: estimate, heading, sensors, judge."""
+        world, index = self._world, self._index
+        truth = world.states[index]
         self._belief = truth if self._estimator is None else self._estimator.update(truth)
         self.autopilot.turn(self._dt_s)
-        self.sense()
+        if t_ns >= self._sense_ns:
+            self.sense()
         judge = self.judge
         if judge is None:
             return
-        t_ns, p_enu, clearance_m = self.t_ns, truth.p_enu, self.clearance_m
-        grounded = self._world.bodies[self._index].on_ground and self.autopilot.external
-        judge.step(t_ns, p_enu, clearance_m, grounded=grounded)
+        clearance_m = world.clearances_m[index]
+        grounded = world.bodies[index].on_ground and self.autopilot.external
+        judge.step(t_ns, truth.p_enu, clearance_m, grounded=grounded)
         if clearance_m < _NEAR_M or at_tick:
-            judge.approach(t_ns, p_enu, self._surroundings())
+            judge.approach(t_ns, truth.p_enu, self._surroundings())
 
     def sense(self) -> None:
         """Let the sensors measure that are due."""
@@ -132,6 +147,7 @@ class Craft:
         for sensor in self.sensors.values():
             if t_ns >= sensor.next_ns:
                 sensor.sample(t_ns, self._surroundings(), self.truth)
+        self._sense_ns = min((sensor.next_ns for sensor in self.sensors.values()), default=_NEVER_NS)
 
     def control(self) -> tuple[Reply, ...]:
         """The autopilot's look at the clock, once a control period."""

@@ -101,9 +101,9 @@ class Flight:
             if craft.judge is None and craft.external:
                 self._begin(craft)
         self.world.step([craft.command() for craft in self.crafts])
-        at_tick = self.at_tick
+        t_ns, at_tick = self.world.t_ns, self.at_tick
         for craft in self.crafts:
-            craft.follow(at_tick=at_tick)
+            craft.follow(t_ns, at_tick=at_tick)
 
     def _begin(self, craft: Craft) -> None:
         if self._started_ns is None:
@@ -162,6 +162,7 @@ def _autopilot(scenario: Scenario, spec: Vehicle, model: Crazyflie) -> Personali
         yaw_rad=spec.yaw_rad,
         control_hz=scenario.control_hz,
         physics_hz=scenario.physics_hz,
+        system_id=spec.system_id,
     )
     parameters = autopilot.parameters
     if "MIS_TAKEOFF_ALT" in parameters.names:

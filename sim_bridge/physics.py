@@ -213,7 +213,9 @@ class World:
         for body in self.bodies:
             p_enu, radius_m, nearest_m = body.state.p_enu, body.vehicle.radius_m, math.inf
             for p_o_enu, r_o_m in zip(self.obstacles_enu, self.radii_m, strict=True):
-                nearest_m = min(nearest_m, math.dist(p_enu, p_o_enu) - radius_m - r_o_m)
+                clearance_m = math.dist(p_enu, p_o_enu) - radius_m - r_o_m
+                if clearance_m < nearest_m:
+                    nearest_m = clearance_m
             nearest.append(nearest_m)
         for j in range(1, len(nearest)):
             for i in range(j):

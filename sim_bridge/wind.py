@@ -51,7 +51,7 @@ def dryden_parameters(w20_m_s: float, height_m: float) -> DrydenParameters:
 
     >>> p = dryden_parameters(W20_M_S["light"], 30.48)
     >>> round(p.sigma_w_m_s, 3), round(p.length_w_m, 2), round(p.length_uv_m, 1)
-    (0.772, 30.48, 153.9)
+    (0.772, 30.48, 154.0)
     """
     h_ft = min(max(height_m / FOOT_M, _LEAST_H_FT), _MOST_H_FT)
     base = 0.177 + 0.000823 * h_ft
