@@ -17,7 +17,7 @@ from sim_bridge.ardupilot_failsafe import LANDING_CONTINUES, PILOT_CONTINUES, Ac
 from sim_bridge.ardupilot_guided import Submode
 from sim_bridge.ardupilot_parameters import ArduParameters
 from sim_bridge.ardupilot_plans import ArduMode
-from sim_bridge.ardupilot_telemetry import LOOP_RATE_HZ, STREAMS, health, rates_hz
+from sim_bridge.ardupilot_telemetry import LOOP_RATE_HZ, STREAMS, News, health, rates_hz
 from sim_bridge.controller import Setpoint
 from sim_bridge.messages import (
     FORCE,
@@ -40,7 +40,6 @@ from sim_bridge.personality import BatteryReading
 from sim_bridge.physics import BodyState
 
 REBOOT_NS = 1_200_000_000  # from the command to the first heartbeat
-PREARM_NS = 30 * NS_PER_S  # between the reasons that it tells by itself
 FORCE_ARM = 2989.0  # param2 of COMPONENT_ARM_DISARM
 
 _NEED_POSITION = (ArduMode.LOITER, ArduMode.RTL, ArduMode.BRAKE)
@@ -84,8 +83,7 @@ class ArduCopter:
         self._control_hz = float(control_hz)
         self._born_airborne = self._copter.airborne
         self._failsafes = Failsafes(self.parameters)
-        self._ekf_told = self._born_airborne
-        self._prearm_told_ns = 0
+        self._news = News(told=self._born_airborne)
         self._nan_told_ns: int | None = None
         self._attitude_told = False
         self._handlers: dict[int, Callable[[Command], tuple[Result, str]]] = {
@@ -237,7 +235,7 @@ class ArduCopter:
         copter.state, copter.t_ns = state, t_ns
         if t_ns < self.up_since_ns:
             return ()
-        texts = self._watch_estimate()
+        texts = self._news.step(self._arming_reasons(), t_ns, position_valid=self.position_valid, armed=self.armed)
         armed = self.armed
         if armed:
             for event in self._failsafes.step(state.p_enu, self.home_enu, t_ns):
@@ -319,24 +317,14 @@ class ArduCopter:
         if self.lockstep:
             return Result.DENIED, "Reboot denied: in lockstep"
         self.up_since_ns = self._copter.t_ns + REBOOT_NS
-        self._born_airborne = self._ekf_told = False
+        self._born_airborne = False
+        self._news = News(told=False)
         self._copter.give(None)
         self._failsafes = Failsafes(self.parameters)
         self._copter.enter(ArduMode.STABILIZE)
         return Result.ACCEPTED, ""
 
     # --- watching
-
-    def _watch_estimate(self) -> list[Text]:
-        """What ArduCopter says by itself: the EKF's position, and twice a minute why it could not be armed."""
-        if self.position_valid and not self._ekf_told:
-            self._ekf_told = True
-            return [Text(Severity.INFO, "EKF3 IMU0 is using GPS")]
-        if self.armed or self._copter.t_ns - self._prearm_told_ns < PREARM_NS:
-            return []
-        self._prearm_told_ns = self._copter.t_ns
-        reasons = [reason for reason in self._arming_reasons() if reason.startswith("PreArm")]
-        return [Text(Severity.CRITICAL, reason) for reason in reasons]
 
     def _answer(self, event: Event) -> list[Text]:
         """What a failsafe leads to here."""

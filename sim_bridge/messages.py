@@ -110,8 +110,8 @@ class Command:
     sender: Sender
     target_system: int = 1
     target_component: int = 1
-    custom_mode: int | None = field(default=None, compare=False)  # SET_MODE's, of which params hold PX4's parts
     frame: int = 0  # MAV_FRAME of a COMMAND_INT; a COMMAND_LONG means 0, global with altitudes above sea level
+    custom_mode: int | None = field(default=None, compare=False)  # SET_MODE's, of which params hold PX4's parts
 
 
 @dataclass(frozen=True, slots=True)
