@@ -11,14 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
+from sim_bridge.ardupilot_arming import arming_reasons
 from sim_bridge.ardupilot_copter import PILOTED, Copter
 from sim_bridge.ardupilot_failsafe import LANDING_CONTINUES, PILOT_CONTINUES, Action, Event, Failsafes
 from sim_bridge.ardupilot_guided import Submode
 from sim_bridge.ardupilot_parameters import ArduParameters
 from sim_bridge.ardupilot_plans import ArduMode
+from sim_bridge.ardupilot_telemetry import LOOP_RATE_HZ, STREAMS, News, health, rates_hz
 from sim_bridge.controller import Setpoint
 from sim_bridge.messages import (
-    FORCE_DISARM,
+    FORCE,
     NS_PER_S,
     Ack,
     AttitudeTarget,
@@ -38,20 +40,8 @@ from sim_bridge.personality import BatteryReading
 from sim_bridge.physics import BodyState
 
 REBOOT_NS = 1_200_000_000  # from the command to the first heartbeat
-PREARM_NS = 30 * NS_PER_S  # between the reasons that it tells by itself
 FORCE_ARM = 2989.0  # param2 of COMPONENT_ARM_DISARM
 
-_HEARTBEAT, _ATTITUDE_QUATERNION, _LOCAL_POSITION_NED = 0, 31, 32
-_LOOP_RATE_HZ = 320.0  # the fastest stream: 0.8 of its main loop
-_STREAMS: Mapping[int, tuple[int, ...]] = {  # MAV_DATA_STREAM
-    0: (1, 24, 30, 31, 32, 33, 74, 147),
-    2: (1, 24),
-    6: (32, 33),
-    10: (30,),
-    11: (74,),
-    12: (147,),
-}
-_ARMABLE = (*PILOTED, ArduMode.GUIDED)
 _NEED_POSITION = (ArduMode.LOITER, ArduMode.RTL, ArduMode.BRAKE)
 _ACTIONS = {Action.RTL: ArduMode.RTL, Action.LAND: ArduMode.LAND, Action.BRAKE: ArduMode.BRAKE}
 
@@ -65,27 +55,37 @@ class ArduCopter:
         yaw_rad: initial heading, counter-clockwise from east.
         control_hz: the rate of the state on the onboard link in lockstep.
         physics_hz: the fastest stream, unless its own loop is slower.
+        system_id: MAVLink system of the vehicle.
     """
 
     kind = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
-    # float parameters, COMMAND_INT, local setpoints, MAVLink 2, integers as plain floats (C_CAST)
-    capabilities = 2 | 8 | 128 | 8192 | 1 << 17
+    # float parameters, COMMAND_INT, local and global setpoints, MAVLink 2, integers as plain floats (C_CAST)
+    capabilities = 2 | 8 | 128 | 256 | 8192 | 1 << 17
     version = 4 << 24 | 7 << 16  # 4.7.0-dev
+    unknown_stream = Result.FAILED
+    too_fast_stream = Result.DENIED
 
     def __init__(
-        self, *, start_enu: Vec3, rest_height_m: float, yaw_rad: float, control_hz: int = 20, physics_hz: int = 240
+        self,
+        *,
+        start_enu: Vec3,
+        rest_height_m: float,
+        yaw_rad: float,
+        control_hz: int = 20,
+        physics_hz: int = 240,
+        system_id: int = 1,
     ) -> None:
-        self.parameters = ArduParameters()
-        self.max_rate_hz = min(float(physics_hz), _LOOP_RATE_HZ)
+        self.parameters = ArduParameters(system_id)
+        self.max_rate_hz = min(float(physics_hz), LOOP_RATE_HZ)
         self.lockstep = False
         self.up_since_ns = 0
         self._copter = Copter(start_enu, yaw_rad, rest_height_m, self.parameters)
         self._control_hz = float(control_hz)
         self._born_airborne = self._copter.airborne
         self._failsafes = Failsafes(self.parameters)
-        self._ekf_told = self._born_airborne
-        self._prearm_told_ns = 0
+        self._news = News(told=self._born_airborne)
         self._nan_told_ns: int | None = None
+        self._attitude_told = False
         self._handlers: dict[int, Callable[[Command], tuple[Result, str]]] = {
             Cmd.COMPONENT_ARM_DISARM: self._arm_disarm,
             Cmd.NAV_TAKEOFF: self._takeoff,
@@ -147,15 +147,24 @@ class ArduCopter:
         since_ns = self._copter.t_ns - self.up_since_ns
         return self._born_airborne or self.lockstep or since_ns >= self.parameters["SIM_EKF_READY"] * NS_PER_S
 
+    @property
+    def health(self) -> tuple[int, int, int]:
+        return health(position_valid=self.position_valid, can_arm=self.armed or not self._arming_reasons())
+
+    @property
+    def charge_state(self) -> int:
+        """MAV_BATTERY_CHARGE_STATE: 1 fine, 2 low, 3 critical."""
+        return 1 + self._failsafes.battery_level
+
+    def attitude_target(self) -> AttitudeTarget | None:
+        """Never: attitude setpoints are left out."""
+        return None
+
     def rates_hz(self, link: LinkName) -> Mapping[int, float]:
-        """Heartbeats only; in lockstep also the state that the companion answers."""
-        if self.lockstep and link is LinkName.ONBOARD:
-            return {_HEARTBEAT: 1.0, _ATTITUDE_QUATERNION: self._control_hz, _LOCAL_POSITION_NED: self._control_hz}
-        return {_HEARTBEAT: 1.0}
+        return rates_hz(self._control_hz if self.lockstep and link is LinkName.ONBOARD else None)
 
     def stream_group(self, stream: int) -> tuple[int, ...]:
-        """Messages of a MAV_DATA_STREAM."""
-        return _STREAMS.get(stream, ())
+        return STREAMS.get(stream, ())
 
     def position_target(self) -> LocalSetpoint | None:
         if self.mode is not ArduMode.GUIDED:
@@ -184,7 +193,7 @@ class ArduCopter:
             return ()
         copter.t_ns = t_ns
         before = guided.submode
-        finite = guided.take(setpoint, copter.state.p_enu, copter.nose, t_ns)
+        finite = guided.take(setpoint, copter.state.p_enu, self.home_enu[2], copter.nose, t_ns)
         goes = guided.submode in (Submode.POSITION, Submode.POSITION_VELOCITY)
         if goes and self._failsafes.outside(guided.p_enu, self.home_enu):
             guided.stop()
@@ -196,13 +205,15 @@ class ArduCopter:
         return (Text(Severity.CRITICAL, "NaN in setpoint: ArduCopter would crash"),)
 
     def attitude_setpoint(self, setpoint: AttitudeTarget, t_ns: int) -> tuple[Reply, ...]:
-        return ()
+        """GUIDED's attitude control is left out, and says so once."""
+        told, self._attitude_told = self._attitude_told, True
+        return () if told else (Text(Severity.WARNING, "SET_ATTITUDE_TARGET is not simulated"),)
 
     def manual(self, sticks: Sticks, t_ns: int) -> tuple[Reply, ...]:
         """The sticks of the ground station that SYSID_MYGCS names; they fly the piloted modes."""
         if sticks.sender.system == self.parameters["SYSID_MYGCS"]:
             self._copter.t_ns = t_ns
-            self._copter.give(sticks)
+            self._copter.give(None if sticks.released else sticks)
         return ()
 
     def heard_station(self, t_ns: int, system: int = 255) -> None:
@@ -224,7 +235,7 @@ class ArduCopter:
         copter.state, copter.t_ns = state, t_ns
         if t_ns < self.up_since_ns:
             return ()
-        texts = self._watch_estimate()
+        texts = self._news.step(self._arming_reasons(), t_ns, position_valid=self.position_valid, armed=self.armed)
         armed = self.armed
         if armed:
             for event in self._failsafes.step(state.p_enu, self.home_enu, t_ns):
@@ -247,7 +258,7 @@ class ArduCopter:
 
     def _arm_disarm(self, command: Command) -> tuple[Result, str]:
         if command.params[0] < 0.5:
-            if self.armed and self.airborne and command.params[1] != FORCE_DISARM:
+            if self.armed and self.airborne and command.params[1] != FORCE:
                 return Result.FAILED, ""  # as the real one: not a word
             self._copter.disarm()
             return Result.ACCEPTED, ""
@@ -260,18 +271,7 @@ class ArduCopter:
         return Result.ACCEPTED, ""
 
     def _arming_reasons(self) -> list[str]:
-        """Why it cannot be armed now, in the order in which ArduCopter looks."""
-        reasons = []
-        if self.parameters["ARMING_CHECK"]:
-            reasons += [f"PreArm: {reason}" for reason in self._failsafes.battery_reasons()]
-        needs_position = self.mode in (ArduMode.LOITER, ArduMode.GUIDED) or bool(self.parameters["FENCE_ENABLE"])
-        if needs_position and not self.position_valid:
-            reasons.append("PreArm: Need Position Estimate")
-        outside = self._failsafes.outside(self._copter.state.p_enu, self.home_enu)
-        reasons += [f"PreArm: Vehicle breaching {name} fence" for name in outside]
-        if self.mode not in _ARMABLE:
-            reasons.append(f"Arm: {self.mode.name} mode not armable")
-        return reasons
+        return arming_reasons(self._copter, self._failsafes, self.parameters, position_valid=self.position_valid)
 
     def _takeoff(self, command: Command) -> tuple[Result, str]:
         above_m = command.params[6]
@@ -317,24 +317,14 @@ class ArduCopter:
         if self.lockstep:
             return Result.DENIED, "Reboot denied: in lockstep"
         self.up_since_ns = self._copter.t_ns + REBOOT_NS
-        self._born_airborne = self._ekf_told = False
-        self._copter.drop_sticks()
+        self._born_airborne = False
+        self._news = News(told=False)
+        self._copter.give(None)
         self._failsafes = Failsafes(self.parameters)
         self._copter.enter(ArduMode.STABILIZE)
         return Result.ACCEPTED, ""
 
     # --- watching
-
-    def _watch_estimate(self) -> list[Text]:
-        """What ArduCopter says by itself: the EKF's position, and twice a minute why it could not be armed."""
-        if self.position_valid and not self._ekf_told:
-            self._ekf_told = True
-            return [Text(Severity.INFO, "EKF3 IMU0 is using GPS")]
-        if self.armed or self._copter.t_ns - self._prearm_told_ns < PREARM_NS:
-            return []
-        self._prearm_told_ns = self._copter.t_ns
-        reasons = [reason for reason in self._arming_reasons() if reason.startswith("PreArm")]
-        return [Text(Severity.CRITICAL, reason) for reason in reasons]
 
     def _answer(self, event: Event) -> list[Text]:
         """What a failsafe leads to here."""

@@ -96,11 +96,9 @@ class Copter:
         """GUIDED has changed its submode: begin where it is, under the acceleration of before."""
         self._follower.anchor(self.state)
 
-    def give(self, sticks: Sticks) -> None:
-        self._sticks = (self.t_ns, sticks)
-
-    def drop_sticks(self) -> None:
-        self._sticks = None
+    def give(self, sticks: Sticks | None) -> None:
+        """The pilot's sticks now; None: given back."""
+        self._sticks = None if sticks is None else (self.t_ns, sticks)
 
     # --- every physics step
 

@@ -52,12 +52,12 @@ class Failsafes:
         self._station_lost = False
         self._reading: BatteryReading | None = None
         self._low_since_ns: dict[str, int] = {}
-        self._battery_level = 0  # 1 low, 2 critical
+        self.battery_level = 0  # 1 low, 2 critical; it does not recover
         self._breached: frozenset[str] = frozenset()
 
     @property
     def active(self) -> bool:
-        return self._station_lost or self._battery_level > 0
+        return self._station_lost or self.battery_level > 0
 
     def heard_station(self, t_ns: int) -> None:
         self._station_ns = t_ns
@@ -131,8 +131,8 @@ class Failsafes:
                 continue
             since_ns = self._low_since_ns.setdefault(prefix, t_ns)
             waits_s = float(parameters["BATT_LOW_TIMER"]) if what == "voltage" else 0.0
-            if self._battery_level < level and t_ns - since_ns >= waits_s * NS_PER_S:
-                self._battery_level = level
+            if self.battery_level < level and t_ns - since_ns >= waits_s * NS_PER_S:
+                self.battery_level = level
                 action = _BATTERY.get(int(parameters["BATT_FS_CRT_ACT" if level == 2 else "BATT_FS_LOW_ACT"]))
                 used = f"{reading.voltage_v:.2f}V used {reading.consumed_mah:.0f} mAh"
                 return Event(Text(Severity.WARNING, f"Battery 1 is {name} {used}"), action or Action.NONE)

@@ -11,11 +11,14 @@ from __future__ import annotations
 import math
 from enum import Enum, auto
 
-from sim_bridge.messages import LocalSetpoint, Vec3
+from sim_bridge.messages import HOME_ALTITUDE_AMSL_M, LocalSetpoint, Vec3
 
 LOCAL_NED, LOCAL_OFFSET_NED, BODY_NED, BODY_OFFSET_NED = 1, 7, 8, 9  # MAV_FRAME
 _FRAMES = (LOCAL_NED, LOCAL_OFFSET_NED, BODY_NED, BODY_OFFSET_NED)
 _BODY = (BODY_NED, BODY_OFFSET_NED)
+_OFFSET = (LOCAL_OFFSET_NED, BODY_NED, BODY_OFFSET_NED)
+_ABOVE_HOME = (3, 6)  # MAV_FRAME_GLOBAL_RELATIVE_ALT, and _INT
+_GLOBAL = (0, 5, *_ABOVE_HOME)  # the others are above terrain, of which there is no map
 _POSITION, _VELOCITY, _ACCELERATION, _FORCE, _YAW, _YAW_RATE = 0x007, 0x038, 0x1C0, 0x200, 0x400, 0x800
 _NOSE_AHEAD_M_S = 0.7  # slower, the nose stays
 _NOSE_RAD_S = math.radians(60.0)  # ATC_SLEW_YAW
@@ -65,7 +68,7 @@ class Nose:
         mask = setpoint.type_mask
         if not mask & _YAW:
             relative = setpoint.frame in _BODY
-            turn = setpoint.yaw_rad - 0.5 * math.pi  # north, the zero of the wire, is straight ahead
+            turn = setpoint.yaw_rad - 0.5 * math.pi  # the decoder takes the wire's zero for north; here it is ahead
             self.rate_rad_s, self.goal_rad = None, self.yaw_rad + turn if relative else setpoint.yaw_rad
         elif not mask & _YAW_RATE:
             self.rate_rad_s, self.goal_rad = setpoint.yaw_rate_rad_s, None
@@ -120,7 +123,7 @@ class Guided:
     def taking_off(self) -> bool:
         return self.submode is Submode.TAKEOFF and not self.took_off
 
-    def take(self, setpoint: LocalSetpoint, p_enu: Vec3, nose: Nose, t_ns: int) -> bool:
+    def take(self, setpoint: LocalSetpoint, p_enu: Vec3, home_z_m: float, nose: Nose, t_ns: int) -> bool:
         """Take a setpoint at the vehicle's position; False where it is stopped by one that holds no number."""
         mask = setpoint.type_mask
         uses_p, uses_v, uses_a = (not mask & group for group in (_POSITION, _VELOCITY, _ACCELERATION))
@@ -129,11 +132,14 @@ class Guided:
             self.stop()
             return False
         submode = _submode(uses_p, uses_v, uses_a)
-        if setpoint.frame not in _FRAMES or submode is None or (mask & _FORCE and uses_a):
+        frames = _GLOBAL if setpoint.is_global else _FRAMES
+        if setpoint.frame not in frames or submode is None or (mask & _FORCE and uses_a):
             self.stop()
             return True
-        ahead_rad = nose.yaw_rad - 0.5 * math.pi if setpoint.frame in _BODY else 0.0
-        offset = p_enu if setpoint.frame != LOCAL_NED else _ZERO
+        ahead_rad = nose.yaw_rad if setpoint.frame in _BODY else 0.0  # body vectors are FLU
+        offset = p_enu if setpoint.frame in _OFFSET else _ZERO
+        if setpoint.is_global:
+            offset = (0.0, 0.0, home_z_m if setpoint.frame in _ABOVE_HOME else -HOME_ALTITUDE_AMSL_M)
         nose.take(setpoint)
         x, y, z = turned(setpoint.p_enu, ahead_rad) if uses_p else _ZERO
         self._set(

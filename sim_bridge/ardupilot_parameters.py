@@ -22,7 +22,7 @@ class Definition:
 
 DEFINITIONS: dict[str, Definition] = {
     "ANGLE_MAX": Definition(3000, INT16),  # lean angle [0.01 deg]
-    "ARMING_CHECK": Definition(1, INT32),  # 0: position, mode and battery are not looked at
+    "ARMING_CHECK": Definition(1, INT32),  # 0: the battery is not looked at before arming
     "BATT_ARM_MAH": Definition(0, INT32),  # least that is left for arming [mAh]
     "BATT_CAPACITY": Definition(250, INT32),  # [mAh]; the Crazyflie's, ArduPilot's default is 3300
     "BATT_CRT_MAH": Definition(0.0, REAL32),  # critical when no more is left [mAh], 0: never
@@ -55,6 +55,7 @@ DEFINITIONS: dict[str, Definition] = {
     "RTL_LOIT_TIME": Definition(5000, INT32),  # over home before landing [ms]
     "SIM_EKF_READY": Definition(2.0, REAL32),  # from boot to a position [s]; ours: the real one takes about 40 s
     "SYSID_MYGCS": Definition(255, INT16),  # system id of the ground station that is watched and whose sticks count
+    "SYSID_THISMAV": Definition(1, INT16),  # constant: the scenario's
     "WPNAV_ACCEL": Definition(250.0, REAL32),  # [cm/s^2]
     "WPNAV_ACCEL_Z": Definition(100.0, REAL32),
     "WPNAV_SPEED": Definition(1000.0, REAL32),  # [cm/s]
@@ -62,14 +63,17 @@ DEFINITIONS: dict[str, Definition] = {
     "WPNAV_SPEED_UP": Definition(250.0, REAL32),
 }
 
+_CONSTANT = ("SYSID_THISMAV",)
+
 
 class ArduParameters:
     """Current values by name."""
 
     names = tuple(sorted(DEFINITIONS))
 
-    def __init__(self) -> None:
+    def __init__(self, system_id: int = 1) -> None:
         self._values: dict[str, float | int] = {name: DEFINITIONS[name].default for name in self.names}
+        self._values["SYSID_THISMAV"] = system_id
 
     def __getitem__(self, name: str) -> float | int:
         return self._values[name]
@@ -83,7 +87,7 @@ class ArduParameters:
 
     def write(self, name: str, value: float | int, *, is_int: bool) -> bool:
         """Set a known parameter, whatever type the sender declared; False for what is not finite."""
-        if not math.isfinite(value):
+        if not math.isfinite(value) or name in _CONSTANT:
             return False
         kind = DEFINITIONS[name].kind
         if kind == REAL32:
@@ -92,6 +96,9 @@ class ArduParameters:
             span = _SPANS[kind]
             self._values[name] = min(max(round(value), -span), span - 1)
         return True
+
+    def checksum(self) -> None:
+        """None: ArduPilot has no _HASH_CHECK, it is an unknown name."""
 
     def metres(self, name: str) -> float:
         """A value in centimetres (or cm/s, cm/s^2), as metres."""

@@ -12,7 +12,7 @@ Attitude law: Brescianini, Hehn, D'Andrea, "Nonlinear Quadrocopter Attitude Cont
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from sim_bridge.crazyflie import Crazyflie, Quad, Triple
@@ -27,6 +27,7 @@ class AccelerationSetpoint:
 
     a_enu: Triple  # [m/s^2]
     yaw_rad: float = 0.0  # body x axis from east, towards north
+    tilt_tan: float | None = field(default=None, compare=False)  # tangent of the most tilt; None: that of the gains
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +44,20 @@ class PositionSetpoint:
 
 
 @dataclass(frozen=True, slots=True)
+class AttitudeSetpoint:
+    """An attitude, or body rates alone where ``q_wxyz`` is None; beside an attitude only the yaw rate counts."""
+
+    q_wxyz: Quad | None  # enu_from_flu
+    thrust: float  # collective, share of full thrust
+    omega_flu: Triple = (0.0, 0.0, 0.0)  # [rad/s]
+
+
+@dataclass(frozen=True, slots=True)
 class MotorsOff:
     """All rotors commanded to zero."""
 
 
-Setpoint: TypeAlias = AccelerationSetpoint | VelocitySetpoint | PositionSetpoint | MotorsOff
+Setpoint: TypeAlias = AccelerationSetpoint | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint | MotorsOff
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,13 +114,30 @@ class Controller:
         if isinstance(setpoint, MotorsOff):
             self.reset()
             return (0.0, 0.0, 0.0, 0.0)
-        fx, fy, fz = self._thrust_vector(self._acceleration(state, setpoint))
+        if isinstance(setpoint, AttitudeSetpoint):
+            return self._follow_attitude(state, setpoint)
+        tilt_tan = setpoint.tilt_tan if isinstance(setpoint, AccelerationSetpoint) else None
+        fx, fy, fz = self._thrust_vector(
+            self._acceleration(state, setpoint), self._tilt_tan if tilt_tan is None else tilt_tan
+        )
         _, x, y, _ = state.q_wxyz
         upright = 1.0 - 2.0 * (x * x + y * y)  # cosine of the tilt
         # the vertical force is kept exact while the body turns: sideways steps do not lift or drop the vehicle
         collective_n = fz / max(upright, _LEAST_UPRIGHT) if upright > 0.0 else 0.0
         torque = self._torque(state, self._wanted_rates(state.q_wxyz, (fx, fy, fz), setpoint.yaw_rad))
         return self.mix(self._thrust_scale * collective_n, torque)
+
+    def _follow_attitude(self, state: BodyState, setpoint: AttitudeSetpoint) -> Quad:
+        wanted = setpoint.omega_flu
+        if setpoint.q_wxyz is not None:
+            w, x, y, z = setpoint.q_wxyz
+            up = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
+            yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            roll_rate, pitch_rate, yaw_rate = self._wanted_rates(state.q_wxyz, up, yaw)
+            wanted = (roll_rate, pitch_rate, yaw_rate + wanted[2])
+        vehicle = self.vehicle
+        share = min(max(setpoint.thrust, 0.0), 1.0)
+        return self.mix(share * vehicle.thrust_to_weight * vehicle.weight_n, self._torque(state, wanted))
 
     def _acceleration(self, state: BodyState, setpoint: Setpoint) -> Triple:
         """Outer loops: a = k_v (v* - v) with v* = k_p (p* - p), no faster than ``v_max_m_s``."""
@@ -137,13 +164,13 @@ class Controller:
             ix, iy, iz = self._integral = _shortened(grown, gains.integral_max_m_s2)
         return (a_enu[0] + ix, a_enu[1] + iy, a_enu[2] + iz)
 
-    def _thrust_vector(self, a_enu: Triple) -> Triple:
+    def _thrust_vector(self, a_enu: Triple, tilt_tan: float) -> Triple:
         """m (a + g e3), its vertical part within the collective's range, its horizontal part within the tilt limit."""
         mass_kg, weight_n, gains = self.vehicle.mass_kg, self._weight_n, self.gains
         fx, fy, fz = mass_kg * a_enu[0], mass_kg * a_enu[1], mass_kg * a_enu[2]
         fz += weight_n
         fz = min(max(fz, gains.least_collective * weight_n), gains.most_collective * weight_n)
-        level, level_max = math.hypot(fx, fy), fz * self._tilt_tan
+        level, level_max = math.hypot(fx, fy), fz * tilt_tan
         if level > level_max:
             fx, fy = fx * level_max / level, fy * level_max / level
         return (fx, fy, fz)

@@ -91,6 +91,17 @@ class Craft:
         return self._belief
 
     @property
+    def accuracy(self) -> tuple[float, float, float]:
+        """Standard deviations of the believed position [m], velocity [m/s] and attitude [rad]; 0 for the truth."""
+        return (0.0, 0.0, 0.0) if self._estimator is None else self._estimator.std
+
+    @property
+    def throttle(self) -> float:
+        """Collective thrust, share of that of all rotors at full speed."""
+        body = self._world.bodies[self._index]
+        return sum(rpm * rpm for rpm in body.rotor_rpm) / (4.0 * body.vehicle.max_rpm**2)
+
+    @property
     def battery(self) -> BatteryState:
         return self._world.batteries[self._index].state
 

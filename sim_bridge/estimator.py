@@ -42,6 +42,7 @@ class Estimator:
         velocity_std = math.hypot(
             noise.velocity_std_m_s, imu.accelerometer_std_m_s2 * math.sqrt(0.5 * dt_s * VELOCITY_T_S)
         )
+        self.std = (noise.position_std_m, velocity_std, noise.attitude_std_rad)  # [m], [m/s], [rad]
         self._rng = rng
         self._position = _GaussMarkov(noise.position_std_m, POSITION_T_S, dt_s)
         self._velocity = _GaussMarkov(velocity_std, VELOCITY_T_S, dt_s)

@@ -170,6 +170,7 @@ def _autopilot(scenario: Scenario, spec: Vehicle, model: Crazyflie) -> Personali
         yaw_rad=spec.yaw_rad,
         control_hz=scenario.control_hz,
         physics_hz=scenario.physics_hz,
+        system_id=spec.system_id,
     )
     parameters = autopilot.parameters
     if "MIS_TAKEOFF_ALT" in parameters.names:

@@ -26,11 +26,12 @@ class LinkName(Enum):
 class Mode(IntEnum):
     """PX4's custom_mode: main << 16 | sub << 24 (px4_custom_mode.h)."""
 
-    MANUAL = 1 << 16
+    MANUAL = 1 << 16  # what PX4 reports of a terminated flight, too
     ALTITUDE = 2 << 16
     POSITION = 3 << 16
     TAKEOFF = 4 << 16 | 2 << 24
     HOLD = 4 << 16 | 3 << 24
+    RETURN = 4 << 16 | 5 << 24
     LAND = 4 << 16 | 6 << 24
     OFFBOARD = 6 << 16
     STABILIZED = 7 << 16
@@ -58,6 +59,7 @@ class Result(IntEnum):
 class Severity(IntEnum):
     """MAV_SEVERITY."""
 
+    EMERGENCY = 0
     CRITICAL = 2
     ERROR = 3
     WARNING = 4
@@ -72,14 +74,22 @@ class Cmd(IntEnum):
     NAV_TAKEOFF = 22
     NAV_GUIDED_ENABLE = 92
     DO_SET_MODE = 176
+    DO_CHANGE_SPEED = 178
+    DO_SET_HOME = 179
+    DO_FLIGHTTERMINATION = 185
+    DO_REPOSITION = 192
+    PREFLIGHT_STORAGE = 245
     PREFLIGHT_REBOOT_SHUTDOWN = 246
     COMPONENT_ARM_DISARM = 400
+    RUN_PREARM_CHECKS = 401
     GET_MESSAGE_INTERVAL = 510
     SET_MESSAGE_INTERVAL = 511
     REQUEST_MESSAGE = 512
+    REQUEST_PROTOCOL_VERSION = 519
+    REQUEST_AUTOPILOT_CAPABILITIES = 520
 
 
-FORCE_DISARM = 21196.0  # param2 of COMPONENT_ARM_DISARM
+FORCE = 21196.0  # param2 of COMPONENT_ARM_DISARM: without asking
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,19 +100,27 @@ class Sender:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """COMMAND_LONG, COMMAND_INT or SET_MODE, addressed to (``target_system``, ``target_component``)."""
+    """COMMAND_LONG, COMMAND_INT or SET_MODE, addressed to (``target_system``, ``target_component``).
+
+    ``params`` are those of the message; a COMMAND_INT with a global frame has its latitude and longitude in degrees.
+    """
 
     command: int
     params: tuple[float, float, float, float, float, float, float]
     sender: Sender
     target_system: int = 1
     target_component: int = 1
+    frame: int = 0  # MAV_FRAME of a COMMAND_INT; a COMMAND_LONG means 0, global with altitudes above sea level
     custom_mode: int | None = field(default=None, compare=False)  # SET_MODE's, of which params hold PX4's parts
 
 
 @dataclass(frozen=True, slots=True)
 class LocalSetpoint:
-    """SET_POSITION_TARGET_LOCAL_NED turned into ENU. Fields that the mask ignores may hold anything."""
+    """SET_POSITION_TARGET_LOCAL_NED or _GLOBAL_INT turned into ENU. Fields that the mask ignores may hold anything.
+
+    In a body frame the vectors are FLU; in a global one the position is local ENU horizontally and its third
+    component the altitude that the frame means.
+    """
 
     time_boot_ms: int
     frame: int  # MAV_FRAME
@@ -113,6 +131,7 @@ class LocalSetpoint:
     yaw_rad: float  # counter-clockwise from east
     yaw_rate_rad_s: float
     sender: Sender = Sender(0, 0)
+    is_global: bool = False  # SET_POSITION_TARGET_GLOBAL_INT
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +155,8 @@ class Sticks:
     up: float  # throttle stick
     turn_left: float  # yaw stick, counter-clockwise
     sender: Sender = Sender(0, 0)
+    radio: bool = False  # RC_CHANNELS_OVERRIDE
+    released: bool = False  # the sender gives its channels back
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +172,25 @@ class Timesync:
 
     tc1: int
     ts1: int
+    sender: Sender
+
+
+@dataclass(frozen=True, slots=True)
+class Ping:
+    """A request (addressed to nobody) that is answered with its own sequence number and time."""
+
+    time_usec: int
+    seq: int
+    sender: Sender
+
+
+@dataclass(frozen=True, slots=True)
+class MissionRequest:
+    """MISSION_REQUEST_LIST, MISSION_CLEAR_ALL or MISSION_COUNT: there is no mission here, and none is taken."""
+
+    message_id: int
+    mission_type: int
+    items: int  # announced by MISSION_COUNT
     sender: Sender
 
 
@@ -186,6 +226,8 @@ Incoming: TypeAlias = (
     | Sticks
     | StationHeartbeat
     | Timesync
+    | Ping
+    | MissionRequest
     | ParamRead
     | ParamWrite
 )

@@ -17,6 +17,7 @@ from sim_bridge.messages import (
     LinkName,
     LocalSetpoint,
     Reply,
+    Result,
     Sticks,
     Vec3,
 )
@@ -56,6 +57,9 @@ class ParameterTable(Protocol):
     def write(self, name: str, value: float | int, *, is_int: bool) -> bool:
         """Set a known parameter; False (and unchanged) for a wrong type or a value out of range."""
 
+    def checksum(self) -> int | None:
+        """What a request for ``_HASH_CHECK`` answers, None: nothing."""
+
 
 class Personality(Protocol):
     """One vehicle's autopilot."""
@@ -63,6 +67,8 @@ class Personality(Protocol):
     kind: int  # MAV_AUTOPILOT
     lockstep: bool  # set by the station: the state streams from the start, at the control rate
     up_since_ns: int  # flight time of its last boot, which its clock counts from; it is silent before
+    unknown_stream: Result  # of a SET_MESSAGE_INTERVAL for a message that does not exist here
+    too_fast_stream: Result  # and of one faster than `max_rate_hz`; ACCEPTED: it comes as fast as it can
 
     @property
     def armed(self) -> bool: ...
@@ -118,6 +124,14 @@ class Personality(Protocol):
     def stream_group(self, stream: int) -> tuple[int, ...]:
         """Messages of a MAV_DATA_STREAM; none where REQUEST_DATA_STREAM is not served."""
 
+    @property
+    def health(self) -> tuple[int, int, int]:
+        """SYS_STATUS's MAV_SYS_STATUS_SENSOR masks: present, enabled, healthy."""
+
+    @property
+    def charge_state(self) -> int:
+        """MAV_BATTERY_CHARGE_STATE."""
+
     def rates_hz(self, link: LinkName) -> Mapping[int, float]:
         """What streams unasked on ``link``: message id to rate."""
 
@@ -156,3 +170,6 @@ class Personality(Protocol):
 
     def position_target(self) -> LocalSetpoint | None:
         """POSITION_TARGET_LOCAL_NED: what is flown, in the form of a setpoint; None: nothing to tell."""
+
+    def attitude_target(self) -> AttitudeTarget | None:
+        """ATTITUDE_TARGET: the attitude or rates that are flown; None where the position loops fly."""

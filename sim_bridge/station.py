@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from typing import Protocol
 
@@ -13,8 +15,10 @@ from sim_bridge.messages import (
     Cmd,
     Command,
     LocalSetpoint,
+    MissionRequest,
     ParamRead,
     ParamWrite,
+    Ping,
     Reply,
     Result,
     StationHeartbeat,
@@ -22,20 +26,24 @@ from sim_bridge.messages import (
     StreamRequest,
     Text,
     Timesync,
+    Vec3,
 )
-from sim_bridge.personality import Personality
+from sim_bridge.personality import BatteryReading, Personality
 from sim_bridge.physics import BodyState
+from sim_bridge.reports import Moment
 from sim_bridge.telemetry import (
     ATTITUDE_QUATERNION,
+    AUTOPILOT_VERSION,
     BUILDERS,
     EXTENDED_SYS_STATE,
     HEARTBEAT,
+    HOME_POSITION,
     LOCAL_POSITION_NED,
-    Moment,
     Streams,
     build,
 )
 
+_HASH_CHECK = "_HASH_CHECK"
 _LOCKSTEP_PINNED = frozenset({HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED})
 
 
@@ -48,6 +56,17 @@ class Vehicle(Protocol):
     @property
     def state(self) -> BodyState:
         """What its estimator believes."""
+
+    @property
+    def accuracy(self) -> tuple[float, float, float]:
+        """Standard deviations of position [m], velocity [m/s] and attitude [rad]."""
+
+    @property
+    def battery(self) -> BatteryReading: ...
+
+    @property
+    def throttle(self) -> float:
+        """Collective, share of full thrust."""
 
 
 class Station:
@@ -75,6 +94,8 @@ class Station:
         self._clock_ns = clock_ns
         self._autopilot.lockstep = lockstep
         self._boot_ns = self._autopilot.up_since_ns
+        # UTC as a receiver of satellites would know it; in lockstep there is none
+        self._unix_start_ns = 0 if lockstep else time.time_ns() - t_ns()
         self._streams = self._fresh_streams()
         self.clock_offset_ns = 0  # by which the vehicle's clock has jumped (faults)
         self.on_text: Callable[[Text], None] = lambda text: None
@@ -123,6 +144,10 @@ class Station:
             for message_id in self._autopilot.stream_group(content.stream):
                 interval_us = 1e6 / content.rate_hz if content.rate_hz else -1.0
                 self._streams[link].request(message_id, interval_us, self._t_ns())
+        elif isinstance(content, Ping):
+            link.send(link.encoder.ping(content))
+        elif isinstance(content, MissionRequest):
+            link.send(link.encoder.no_mission(content))
         elif isinstance(content, ParamRead):
             self._read_parameters(link, content)
         else:
@@ -142,17 +167,24 @@ class Station:
                 link.send(link.encoder.ack(reply))
 
     def announce(self) -> None:
-        """At once: a heartbeat at a change of mode or arming, EXTENDED_SYS_STATE at a change of landed state."""
+        """At once what changed: HEARTBEAT (mode, arming), EXTENDED_SYS_STATE (landed), HOME_POSITION."""
         status = self._status()
         if not self._up() or status == self._announced:
             return
         if status[:2] != self._announced[:2]:
             self.send(HEARTBEAT)
         if status[2] != self._announced[2]:
-            for link in self._router.links:
-                if self._streams[link].interval_us(EXTENDED_SYS_STATE) > 0:
-                    self._send_one(link, EXTENDED_SYS_STATE, self._moment())
+            self._announce(EXTENDED_SYS_STATE)
+        if status[3] != self._announced[3]:
+            self._announce(HOME_POSITION)
         self._announced = status
+
+    def _announce(self, message_id: int) -> None:
+        """One message now, on the links on which it streams."""
+        now = self._moment()
+        for link in self._router.links:
+            if self._streams[link].interval_us(message_id) > 0:
+                self._send_one(link, message_id, now)
 
     def stream(self, *links: Link) -> None:
         """Send what is due on each of ``links``, one datagram a link."""
@@ -181,22 +213,37 @@ class Station:
         link.send(build(message_id, now, link.encoder), timed=timed)
 
     def _moment(self) -> Moment:
+        vehicle = self._vehicle
+        system = self._router.id.system
+        t_ns = max(0, self._t_ns() + self.clock_offset_ns - self._boot_ns)
+        unix_ns = self._unix_start_ns and self._unix_start_ns + t_ns
         return Moment(
-            max(0, self._t_ns() + self.clock_offset_ns - self._boot_ns),
-            self._vehicle.state,
+            t_ns,
+            vehicle.state,
             self._autopilot,
-            self._router.id.system,
+            vehicle.battery,
+            vehicle.accuracy,
+            system,
+            vehicle.throttle,
+            unix_ns,
         )
 
-    def _status(self) -> tuple[int, bool, int]:
+    def _status(self) -> tuple[int, bool, int, Vec3]:
         autopilot = self._autopilot
-        return (autopilot.custom_mode, autopilot.armed, int(autopilot.landed))
+        return (autopilot.custom_mode, autopilot.armed, int(autopilot.landed), autopilot.home_enu)
 
     def _command(self, link: Link, command: Command) -> tuple[Reply, ...]:
         streams = self._streams[link]
         message_id = int(command.params[0]) if abs(command.params[0]) < 1 << 24 else -1
         if command.command == Cmd.SET_MESSAGE_INTERVAL:
-            granted = streams.request(message_id, command.params[1], self._t_ns())
+            result = self._set_interval(streams, message_id, command.params[1])
+            return (Ack(command.command, result, command.sender),)
+        if command.command == Cmd.REQUEST_PROTOCOL_VERSION:
+            link.send(link.encoder.protocol_version())
+            granted = True
+        elif command.command == Cmd.REQUEST_AUTOPILOT_CAPABILITIES:
+            self._send_one(link, AUTOPILOT_VERSION, self._moment())
+            granted = True
         elif command.command == Cmd.GET_MESSAGE_INTERVAL:
             link.send(link.encoder.message_interval(message_id & 0xFFFF, streams.interval_us(message_id)))
             granted = message_id in BUILDERS
@@ -208,8 +255,23 @@ class Station:
             return self._autopilot.command(command, self._vehicle.state, self._t_ns())
         return (Ack(command.command, Result.ACCEPTED if granted else Result.DENIED, command.sender),)
 
+    def _set_interval(self, streams: Streams, message_id: int, interval_us: float) -> Result:
+        """Microseconds, -1 off, 0 the default; what is faster than the vehicle may be granted as fast as it goes."""
+        if message_id not in BUILDERS or not math.isfinite(interval_us):
+            return self._autopilot.unknown_stream
+        if streams.too_fast(interval_us):
+            if self._autopilot.too_fast_stream is not Result.ACCEPTED:
+                return self._autopilot.too_fast_stream
+            interval_us = streams.least_us
+        streams.request(message_id, interval_us, self._t_ns())
+        return Result.ACCEPTED
+
     def _read_parameters(self, link: Link, wanted: ParamRead) -> None:
         known = self._autopilot.parameters.names
+        if wanted.name == _HASH_CHECK or (not wanted.name and wanted.index < 0):
+            checksum = self._autopilot.parameters.checksum()
+            if checksum is not None:
+                link.send(link.encoder.param_checksum(checksum, len(known)))
         if wanted.name:
             names: tuple[str, ...] = (wanted.name,) if wanted.name in known else ()
         elif wanted.index >= 0:

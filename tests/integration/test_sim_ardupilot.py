@@ -1,4 +1,4 @@
-"""`sim-bridge run --check` with the ardupilot personality and the daemon as it is started for it: processes and sockets."""
+"""`sim-bridge run --check` with the ardupilot personality and the daemon that it starts: processes and sockets."""
 
 from __future__ import annotations
 
@@ -73,4 +73,4 @@ def test_the_daemon_flies_it(tmp_path: Path, z: float, operator: str, pace: tupl
     )
     assert done.returncode == 0, done.stdout.decode() + done.stderr.decode()
     report: dict[str, Any] = json.loads(done.stdout)
-    assert report
+    assert report["flight"]["ended"] == "reached"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,7 +166,8 @@ def test_nan_stops_it_and_is_told_where_the_real_one_crashed(rig: Callable[..., 
 def test_frames_turn_with_the_nose_or_do_not(rig: Callable[..., Rig], frame: int) -> None:
     """Forward (x of the wire) in a body frame is where the nose points; in a local one it is north."""
     flown = rig(yaw_deg=180.0).guided()
-    flown.fly(1.0, setpoint((0.0, 1.0, 0.0), mask=ACCELERATION_YAW_RATE, frame=frame))
+    north, ahead = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)  # as the decoder makes x of the wire: ENU, and FLU
+    flown.fly(1.0, setpoint(north if frame in (1, 7) else ahead, mask=ACCELERATION_YAW_RATE, frame=frame))
     assert flown.v[0] == pytest.approx(0.0 if frame in (1, 7) else -0.85, abs=0.08)
     assert flown.v[1] == pytest.approx(0.85 if frame in (1, 7) else 0.0, abs=0.08)
 
@@ -178,6 +180,15 @@ def test_position_masks_fly_there_and_hold(rig: Callable[..., Rig]) -> None:
     flown.fly(0.1, setpoint(mask=POSITION, p=(-1.0, 0.0, 0.0), frame=7))
     flown.fly(5.0)
     assert flown.p == pytest.approx((1.0, -1.0, 21.0), abs=0.05)
+
+
+@pytest.mark.parametrize(("frame", "z"), [(6, 21.0), (5, 509.0), (11, None)])
+def test_global_positions_above_home_or_the_sea(rig: Callable[..., Rig], frame: int, z: float | None) -> None:
+    """The local origin is 488 m above the sea; there is no terrain, and what is above it stops."""
+    flown = rig().guided()
+    there = replace(setpoint(mask=POSITION, p=(1.0, 0.0, z or 21.0), frame=frame), is_global=True)
+    flown.fly(6.0, there)
+    assert flown.p == pytest.approx((1.0, 0.0, 21.0) if z else (0.0, 0.0, 20.0), abs=0.06)
 
 
 def test_velocity_masks_and_the_one_with_acceleration(rig: Callable[..., Rig]) -> None:

@@ -54,8 +54,9 @@ class Bench:
     def __init__(self) -> None:
         self.companion, self.ground = Peer(1, 196), Peer(245, 190)
         self.flight = Flight(resolve("bench", parse_scenario(AIRBORNE, source="bench"), 0))
+        self.craft = self.flight.crafts[0]
         self.router = Router(self.companion.port, self.ground.port)
-        self.station = Station(self.flight, self.router, t_ns=self.t_ns, clock_ns=self.t_ns, lockstep=False)
+        self.station = Station(self.craft, self.router, t_ns=self.t_ns, clock_ns=self.t_ns, lockstep=False)
         self.onboard_link, self.ground_link = self.router.links
         self.station.stream(*self.router.links)
 
@@ -71,7 +72,7 @@ class Bench:
         for _ in range(round(seconds * 240)):
             self.flight.advance()
             if self.flight.at_tick:
-                self.station.say(self.flight.control())
+                self.station.say(self.flight.control()[0])
                 self.station.announce()
             self.station.stream(*self.router.links)
 
@@ -196,9 +197,17 @@ def test_default_rates_and_message_intervals(bench: Bench) -> None:
     assert len(bench.companion.received("LOCAL_POSITION_NED")) == pytest.approx(20, abs=1)
 
 
-@pytest.mark.parametrize("params", [(9999, 100_000), (32, 1000), (math.nan, 100_000), (32, math.nan)])
-def test_intervals_that_cannot_be_had_are_denied(bench: Bench, params: tuple[float, float]) -> None:
-    assert bench.order(long(511, *params)) == 2
+@pytest.mark.parametrize("params", [(9999, 100_000), (math.nan, 100_000), (32, math.nan)])
+def test_intervals_that_cannot_be_had_fail(bench: Bench, params: tuple[float, float]) -> None:
+    assert bench.order(long(511, *params)) == 4  # MAV_RESULT_FAILED, as PX4 has it
+
+
+def test_a_stream_faster_than_the_physics_is_denied(bench: Bench) -> None:
+    assert bench.order(long(511, 30, 1000)) == 2
+    bench.ground.send(bench.ground_link, long(510, 30))
+    bench.serve()
+    (told,) = bench.ground.received("MESSAGE_INTERVAL")
+    assert told.interval_us == 100_000  # as before
 
 
 def test_get_interval_and_request_message(bench: Bench) -> None:
@@ -215,8 +224,16 @@ def test_get_interval_and_request_message(bench: Bench) -> None:
 def test_parameters_are_listed_read_and_written(bench: Bench) -> None:
     bench.ground.send(bench.ground_link, dialect.MAVLink_param_request_list_message(1, 1))
     bench.serve()
-    values = bench.ground.received("PARAM_VALUE")
+    check, *values = bench.ground.received("PARAM_VALUE")
+    assert (check.param_id, check.param_index, check.param_type) == ("_HASH_CHECK", 65535, 5)
     assert [m.param_index for m in values] == list(range(values[0].param_count))
+    crc = 0  # CRC-32 without inversions over names and values, bit by bit
+    for m in values:
+        for byte in m.param_id.encode() + struct.pack("<f", m.param_value):
+            crc ^= byte
+            for _ in range(8):
+                crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
+    assert struct.unpack("<I", struct.pack("<f", check.param_value)) == (crc,)
     assert {"COM_OF_LOSS_T", "MIS_TAKEOFF_ALT", "COM_OBL_RC_ACT"} <= {m.param_id for m in values}
     write = dialect.MAVLink_param_set_message(1, 1, b"COM_OBL_RC_ACT", struct.unpack("<f", struct.pack("<i", 4))[0], 6)
     bench.ground.send(bench.ground_link, write)
@@ -241,18 +258,18 @@ def test_a_setpoint_moves_the_vehicle_and_its_loss_stops_it(bench: Bench) -> Non
     assert abs(before.z + 1.5) < 0.1
     bench.companion.received("HEARTBEAT")
     bench.fly(0.95)
-    assert bench.flight.autopilot.mode is Mode.OFFBOARD
-    while bench.flight.autopilot.mode is Mode.OFFBOARD and bench.flight.t_ns < 4_000_000_000:
+    assert bench.craft.autopilot.mode is Mode.OFFBOARD
+    while bench.craft.autopilot.mode is Mode.OFFBOARD and bench.flight.t_ns < 4_000_000_000:
         bench.fly(1 / 240)
-    assert bench.flight.autopilot.mode is Mode.HOLD
-    held = bench.flight.state.p_enu
+    assert bench.craft.autopilot.mode is Mode.HOLD
+    held = bench.craft.state.p_enu
     (at_once,) = [m for m in bench.companion.received("HEARTBEAT") if m.custom_mode == 4 << 16 | 3 << 24]
     assert at_once.base_mode & 128
     lost = bench.ground.received("STATUSTEXT")[-1]
     assert lost.severity == 2
     assert "setpoints lost" in lost.text
     bench.fly(4.0)
-    assert math.dist(bench.flight.state.p_enu, held) < 0.1  # comes back to where the failsafe caught it
+    assert math.dist(bench.craft.state.p_enu, held) < 0.1  # comes back to where the failsafe caught it
 
 
 def test_a_force_setpoint_is_refused_and_told(bench: Bench) -> None:
@@ -265,12 +282,17 @@ def test_a_force_setpoint_is_refused_and_told(bench: Bench) -> None:
 
 
 def test_the_setpoint_is_echoed_on_request(bench: Bench) -> None:
+    stream(bench, 0.55)
+    assert bench.order(long(176, 1.0, 6.0), ground=False) == 0
     stream(bench, 0.1, north_m_s2=1.25)
-    assert bench.order(long(512, 85), ground=False) == 0
+    bench.companion.received_all()
     bench.companion.send(bench.onboard_link, long(512, 85))
     bench.serve()
     (echo,) = bench.companion.received("POSITION_TARGET_LOCAL_NED")
-    assert (echo.type_mask, echo.afx, echo.coordinate_frame) == (0x0C3F, 1.25, 1)
+    assert (echo.type_mask, echo.afx, echo.coordinate_frame) == (0x003F, 1.25, 1)  # what is NaN is marked
+    assert math.isnan(echo.x)
+    assert math.isnan(echo.vy)
+    assert echo.yaw == pytest.approx(math.pi / 2)  # the heading that is held: east
 
 
 def test_landed_state_changes_are_sent_at_once(bench: Bench) -> None:
@@ -280,4 +302,4 @@ def test_landed_state_changes_are_sent_at_once(bench: Bench) -> None:
     assert bench.companion.received("EXTENDED_SYS_STATE")[-1].landed_state == 4
     bench.fly(6.0)
     assert bench.companion.received("EXTENDED_SYS_STATE")[-1].landed_state == 1
-    assert not bench.flight.autopilot.armed
+    assert not bench.craft.autopilot.armed

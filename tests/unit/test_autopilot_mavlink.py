@@ -12,13 +12,18 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sim_bridge.mavlink import Decoder, Encoder, Packet, q_ned_from_frd
 from sim_bridge.messages import (
     Ack,
+    AttitudeTarget,
     Command,
     LocalSetpoint,
+    MissionRequest,
     ParamRead,
     ParamWrite,
+    Ping,
     Result,
     Sender,
     Severity,
+    StationHeartbeat,
+    Sticks,
     Text,
     Timesync,
 )
@@ -68,6 +73,81 @@ def test_statustext_and_timesync_bytes() -> None:
     assert Encoder().timesync(Timesync(0, 77, Sender(1, 196)), 5_000_000_000) == packet(111, payload, 34)
 
 
+def test_long_texts_go_in_chunks() -> None:
+    text = "Failsafe: ground station lost, holding 5 s, then returning"  # 58 characters
+    first = struct.pack("<B50sHB", 2, text[:50].encode(), 1, 0)
+    second = struct.pack("<B50sHB", 2, text[50:].encode(), 1, 1)
+    encoder = Encoder()
+    expected = packet(253, first, 83) + packet(253, second, 83, seq=1)
+    assert encoder.text(Text(Severity.CRITICAL, text)) == expected
+    chunks = dialect.MAVLink(None).parse_buffer(encoder.text(Text(Severity.CRITICAL, "x" * 100)))
+    # a full chunk does not end the text: an empty one follows
+    assert [(m.text, m.id, m.chunk_seq) for m in chunks] == [("x" * 50, 2, 0), ("x" * 50, 2, 1), ("", 2, 2)]
+
+
+def test_ping_missions_and_protocol_version_bytes() -> None:
+    # time_usec u64, seq u32, target_system u8, target_component u8; CRC_EXTRA 237
+    request = struct.pack("<QIBB", 123_456_789_012, 7, 0, 0)
+    ping = read(packet(4, request, 237, sender=(245, 190))).content
+    assert ping == Ping(123_456_789_012, 7, Sender(245, 190))
+    assert Encoder().ping(ping) == packet(4, struct.pack("<QIBB", 123_456_789_012, 7, 245, 190), 237)
+    answer = packet(4, struct.pack("<QIBB", 1, 7, 1, 1), 237)
+    assert read(answer).content is None  # an answer, not a request
+    wanted = read(packet(43, struct.pack("<BBB", 1, 1, 1), 132, sender=(245, 190))).content  # of the fence
+    assert wanted == MissionRequest(43, 1, 0, Sender(245, 190))
+    # count u16, target_system, target_component, mission_type; CRC_EXTRA 221 (opaque_id, an extension, is 0)
+    assert Encoder().no_mission(wanted) == packet(44, struct.pack("<HBBB", 0, 245, 190, 1), 221)
+    announced = MissionRequest(44, 0, 3, Sender(245, 190))  # target_system, target_component, type 4: NO_SPACE
+    assert Encoder().no_mission(announced) == packet(47, struct.pack("<BBBB", 245, 190, 4, 0), 153)
+    # version, min, max u16, two hashes of 8; CRC_EXTRA 217
+    assert Encoder(3).protocol_version() == packet(300, struct.pack("<HHH16x", 200, 100, 200), 217, sender=(3, 1))
+
+
+def test_body_frame_global_and_attitude_setpoints() -> None:
+    values = (0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.25, 0.5)  # forward, right, down
+    payload = struct.pack("<I11fHBBB", 1250, *values, 0x0DC7, 1, 1, 8)
+    got = read(packet(84, payload, 143, sender=(1, 196))).content
+    assert isinstance(got, LocalSetpoint)
+    assert (got.v_enu, got.a_enu, got.frame) == ((1.0, -2.0, -3.0), (4.0, -5.0, -6.0), 8)  # FLU
+    # time u32, lat lon i32, alt vx vy vz ax ay az yaw yaw_rate f32, mask u16, targets, frame; CRC_EXTRA 5
+    place = (473977420 + 89932, 85455940, 490.0)  # 8.9932e-3 deg north: 1000 m
+    payload = struct.pack("<Iii9fHBBB", 1250, *place, 1.0, 2.0, 3.0, 0, 0, 0, 0.25, 0.5, 0x0DF8, 1, 1, 6)
+    got = read(packet(86, payload, 5, sender=(1, 196))).content
+    assert isinstance(got, LocalSetpoint)
+    assert got.p_enu == pytest.approx((0.0, 1000.0, 490.0), abs=0.01)
+    assert (got.v_enu, got.frame, got.is_global) == ((2.0, 1.0, -3.0), 6, True)
+    # time u32, q 4 f32, three rates f32, thrust f32, target_system, target_component, type_mask; CRC_EXTRA 49
+    half = math.sqrt(0.5)  # NED from FRD: heading east
+    payload = struct.pack("<I8fBBB", 1250, half, 0.0, 0.0, half, 0.1, 0.2, 0.3, 0.45, 1, 1, 0x03)
+    target = read(packet(82, payload, 49, sender=(1, 196))).content
+    assert isinstance(target, AttitudeTarget)
+    assert target.q_wxyz == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-6)  # east, level
+    assert target.omega_flu == pytest.approx((0.1, -0.2, -0.3))
+    assert (target.thrust, target.type_mask) == (pytest.approx(0.45), 0x03)
+
+
+def test_sticks_and_the_heartbeats_of_ground_stations() -> None:
+    # x y z r i16, buttons u16, target u8; CRC_EXTRA 243: forward, right, throttle 0 to 1000, clockwise
+    payload = struct.pack("<hhhhHB", 500, 250, 750, -100, 0, 1)
+    sticks = read(packet(69, payload, 243, sender=(245, 190)))
+    assert sticks.target == Sender(1, 0)
+    assert sticks.content == Sticks(0.5, -0.25, 0.5, 0.1, Sender(245, 190))
+    payload = struct.pack("<hhhhHB", 0x7FFF, 0, 500, 0, 0, 1)
+    assert read(packet(69, payload, 243)).content is None
+    # eight channels u16, target_system, target_component; CRC_EXTRA 124: roll, pitch, throttle, yaw
+    payload = struct.pack("<8HBB", 1625, 1750, 1250, 1500, 0, 0, 0, 0, 1, 1)
+    assert read(packet(70, payload, 124, sender=(245, 190))).content == Sticks(
+        0.5, -0.25, -0.5, 0.0, Sender(245, 190), radio=True
+    )
+    payload = struct.pack("<8HBB", 0, 0, 0, 0, 0, 0, 0, 0, 1, 1)
+    released = read(packet(70, payload, 124)).content
+    assert isinstance(released, Sticks)
+    assert released.released
+    station = struct.pack("<IBBBBB", 0, 6, 8, 0, 4, 3)
+    assert read(packet(0, station, 50, sender=(245, 190))).content == StationHeartbeat(Sender(245, 190))
+    assert read(packet(0, struct.pack("<IBBBBB", 0, 18, 8, 0, 4, 3), 50)).content is None
+
+
 def test_integer_parameters_travel_bytewise() -> None:
     payload = struct.pack("<iHH16sB", 5, 8, 2, b"COM_OBL_RC_ACT", 6)  # CRC_EXTRA 220
     assert Encoder().param("COM_OBL_RC_ACT", 5, 2, 8) == packet(22, payload, 220)
@@ -101,7 +181,17 @@ def test_commands_long_int_and_set_mode() -> None:
     assert read(packet(76, payload, 152, sender=(245, 190))).content == expected
     payload = struct.pack("<4fiifHBBBBB", 1.0, 0, 0, 0, 30, -40, 5.0, 22, 1, 1, 1, 0, 0)  # CRC_EXTRA 158
     got = read(packet(75, payload, 158, sender=(245, 190))).content
-    assert got == Command(22, (1.0, 0.0, 0.0, 0.0, 30.0, -40.0, 5.0), Sender(245, 190), 1, 1)
+    assert got == Command(22, (1.0, 0.0, 0.0, 0.0, 30.0, -40.0, 5.0), Sender(245, 190), 1, 1, frame=1)
+    payload = struct.pack("<4fiifHBBBBB", -1.0, 1.0, 0, 0.5, 473977420, -85455940, 490.0, 192, 1, 1, 5, 0, 0)
+    got = read(packet(75, payload, 158, sender=(245, 190))).content
+    assert isinstance(got, Command)
+    assert got.frame == 5
+    assert got.params == pytest.approx((-1.0, 1.0, 0.0, 0.5, 47.397742, -8.545594, 490.0), abs=1e-9)
+    payload = struct.pack("<4fiifHBBBBB", -1.0, 1.0, 0, 0, 0x7FFFFFFF, 0x7FFFFFFF, 490.0, 192, 1, 1, 5, 0, 0)
+    got = read(packet(75, payload, 158, sender=(245, 190))).content
+    assert isinstance(got, Command)
+    assert math.isnan(got.params[4])
+    assert math.isnan(got.params[5])
     payload = struct.pack("<IBB", 4 << 16 | 3 << 24, 1, 129)  # custom_mode, target, base_mode; CRC_EXTRA 89
     got = read(packet(11, payload, 89, sender=(245, 190))).content
     assert got == Command(176, (129.0, 4.0, 3.0, 0.0, 0.0, 0.0, 0.0), Sender(245, 190), 1, 1)

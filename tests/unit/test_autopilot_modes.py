@@ -60,7 +60,6 @@ def stream(autopilot: Autopilot, start_ns: int, end_ns: int, period_ns: int = 50
 
 def test_a_whole_flight(grounded: Autopilot) -> None:
     assert isinstance(grounded.target(GROUND), MotorsOff)
-    assert result(grounded.command(TAKEOFF, GROUND, 0)) is Result.TEMPORARILY_REJECTED  # not armed
     assert grounded.command(ARM, GROUND, 0) == (Ack(400, Result.ACCEPTED, GCS),)
     assert isinstance(grounded.target(GROUND), MotorsOff)  # armed on the ground: no thrust
     assert result(grounded.command(TAKEOFF, GROUND, 0)) is Result.ACCEPTED
@@ -175,7 +174,8 @@ def test_setpoint_loss_lands_where_the_parameter_says_so_and_later_where_it_says
 @pytest.mark.parametrize(
     ("name", "value", "is_int"),
     [
-        ("COM_OBL_RC_ACT", 7, True),  # terminate does not act here
+        ("COM_OBL_RC_ACT", 8, True),
+        ("COM_LOW_BAT_ACT", 1, True),  # not one of PX4's values any more
         ("COM_OBL_RC_ACT", 4.0, False),
         ("COM_OF_LOSS_T", 0.0, False),
         ("COM_OF_LOSS_T", NAN, False),
@@ -187,7 +187,7 @@ def test_parameters_refuse_what_would_not_act(airborne: Autopilot, name: str, va
     assert airborne.parameters[name] == before
 
 
-@pytest.mark.parametrize("mask", [0x0C3F, 0x083F, 0x043F, 0x0C07])
+@pytest.mark.parametrize("mask", [0x0C3F, 0x083F, 0x043F, 0x0C07, 0x0DC7, 0x05C7, 0x0FC7])
 def test_accepted_masks(airborne: Autopilot, mask: int) -> None:
     assert airborne.setpoint(setpoint(mask), 0) == ()
     assert airborne.last_setpoint is not None
@@ -198,9 +198,11 @@ def test_accepted_masks(airborne: Autopilot, mask: int) -> None:
     ("bad", "named"),
     [
         (setpoint(0x0E3F), "FORCE"),
-        (setpoint(0x0C38), "0x0C38"),  # position and acceleration
+        (setpoint(0x0C38), "finite"),  # position and acceleration
+        (setpoint(0x0DDF), "0x0DDF"),  # no horizontal setpoint
         (setpoint(0x0FFF), "0x0FFF"),  # nothing
-        (setpoint(0x0C3F, frame=8), "frame 8"),
+        (setpoint(0x0C3F, frame=7), "frame 7"),
+        (setpoint(0x0DF8, frame=8), "0x0DF8"),  # PX4 takes no position in the body frame
         (setpoint(0x0C3F, a=(1.0, NAN, 0.0)), "finite"),
         (setpoint(0x0C3F, a=(1.0, math.inf, 0.0)), "finite"),
     ],
