@@ -10,13 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from sim_bridge.controller import (
-    AccelerationSetpoint,
-    AttitudeSetpoint,
-    MotorsOff,
-    PositionSetpoint,
-    Setpoint,
-)
+from sim_bridge.controller import AccelerationSetpoint, AttitudeSetpoint, MotorsOff, Setpoint
 from sim_bridge.messages import (
     NS_PER_S,
     AttitudeTarget,
@@ -52,6 +46,7 @@ LIFT_OFF_M_S2 = 0.2  # setpoints with more upward acceleration leave the ground
 LIFT_OFF_SHARE = 0.95  # of the hover thrust: an attitude setpoint with less stays on it
 _LEVEL_DESCENT = AccelerationSetpoint((0.0, 0.0, -0.3))  # without a position: drag limits it
 
+_BY_STICKS = (Mode.POSITION, Mode.ALTITUDE, Mode.STABILIZED)
 _CUSTOM_MODE, _AUTO, _GUIDED, _STABILIZED, _MANUAL, _ARMED = 1, 4, 8, 16, 64, 128  # MAV_MODE_FLAG
 _STANDBY, _ACTIVE, _CRITICAL, _TERMINATED = 3, 4, 5, 8  # MAV_STATE
 
@@ -172,7 +167,7 @@ class Autopilot:
             return MotorsOff()
         if mode is Mode.OFFBOARD and self._stream.wanted is not None:
             return self._offboard(self._stream.wanted, state)
-        if mode in (Mode.POSITION, Mode.ALTITUDE, Mode.STABILIZED) and not self._sticks.lost(self._t_ns):
+        if mode in _BY_STICKS and not self._sticks.lost(self._t_ns):
             self._navigator.forget()
             return self._by_sticks(mode, state)
         if self._flies_by_sticks:  # and they are gone
@@ -181,7 +176,10 @@ class Autopilot:
 
     def turn(self, dt_s: float) -> None:
         """One physics step has passed: headings follow yaw rates, integrals and sticks go on."""
-        self._control.integrate(dt_s) if self.airborne else self._control.reset()
+        if self.airborne:
+            self._control.integrate(dt_s)
+        else:
+            self._control.reset()
         mode, wanted = self._commander.mode, self._stream.wanted
         if mode is Mode.OFFBOARD and isinstance(wanted, Trajectory):
             if math.isfinite(wanted.yaw_rad):
@@ -197,8 +195,7 @@ class Autopilot:
 
     @property
     def _flies_by_sticks(self) -> bool:
-        manual = self._commander.mode in (Mode.POSITION, Mode.ALTITUDE, Mode.STABILIZED)
-        return manual and self.armed and self._navigator.goal is None
+        return self._commander.mode in _BY_STICKS and self.armed and self._navigator.goal is None
 
     def _offboard(self, wanted: Trajectory | AttitudeTarget, state: BodyState) -> Setpoint:
         if isinstance(wanted, AttitudeTarget):
@@ -287,7 +284,7 @@ class Autopilot:
     def base_mode(self) -> int:
         mode = self._commander.mode
         base = _CUSTOM_MODE | _STABILIZED
-        if mode in (Mode.POSITION, Mode.ALTITUDE, Mode.STABILIZED, Mode.MANUAL):
+        if mode in _BY_STICKS or mode is Mode.MANUAL:
             base |= _MANUAL | (_GUIDED if mode is Mode.POSITION else 0)
         else:
             base |= _AUTO | _GUIDED
@@ -331,14 +328,13 @@ class Autopilot:
                 return None
             rate = wanted.yaw_rate_rad_s if math.isfinite(wanted.yaw_rate_rad_s) else 0.0
             return _echo(wanted.p_enu, self._control.v_enu, self._control.a_enu, yaw_rad, rate)
-        goal: PositionSetpoint | None = self._navigator.goal
+        goal = self._navigator.goal
         return None if goal is None else _echo(goal.p_enu, FREE, FREE, goal.yaw_rad, 0.0)
 
     def attitude_target(self) -> AttitudeTarget | None:
         """The attitude or rates that are flown, None where the position loops fly."""
         wanted = self._stream.wanted
-        flown = self.armed and self._commander.mode is Mode.OFFBOARD and isinstance(wanted, AttitudeTarget)
-        return wanted if flown and isinstance(wanted, AttitudeTarget) else None
+        return wanted if isinstance(wanted, AttitudeTarget) and self.armed and self.external else None
 
     def rates_hz(self, link: LinkName) -> Mapping[int, float]:
         """What streams unasked on ``link``."""
