@@ -21,13 +21,8 @@ from sim_bridge.craft import Craft
 from sim_bridge.errors import ScenarioError
 from sim_bridge.flight import Flight
 from sim_bridge.impairments import Channel, Impairment, damage_message
-<<<<<<< HEAD
-from sim_bridge.messages import NS_PER_S, Cmd, Command, Reply, Sender
-from sim_bridge.pilot import Pilot, switch_command
-=======
 from sim_bridge.messages import FORCE, NS_PER_S, Cmd, Command, Reply, Sender
-from sim_bridge.pilot import Pilot
->>>>>>> f7-ardu
+from sim_bridge.pilot import Pilot, switch_command
 from sim_bridge.scenario_faults import LINKS, Fault
 from sim_bridge.station import Station
 from sim_bridge.wires import CraftWires, Feed, damage_frame
@@ -265,11 +260,7 @@ class Faults:
         what = hit.fault.what
         if what == "kill":
             craft = self._flight.crafts[hit.craft]
-<<<<<<< HEAD
-            stop = Command(Cmd.COMPONENT_ARM_DISARM, (0.0, _FORCE, 0.0, 0.0, 0.0, 0.0, 0.0), Sender(craft.system_id, 1))
-=======
             stop = Command(Cmd.COMPONENT_ARM_DISARM, (0.0, FORCE, 0, 0, 0, 0, 0), Sender(craft.system_id, 1))
->>>>>>> f7-ardu
             replies = craft.autopilot.command(stop, craft.state, self._flight.t_ns)
             self._say(hit.craft, replies)
         elif what == "clock_jump":
