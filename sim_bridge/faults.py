@@ -30,7 +30,6 @@ from sim_bridge.wires import CraftWires, Feed, damage_frame
 T = TypeVar("T")
 
 _FOREVER_S = 1e6
-_FORCE = 21196.0  # param2 of COMPONENT_ARM_DISARM: in the air too
 _FAULT_DRAWS = 2  # what these generators are for, beside the obstacles' jitter (0) and the sensors (1)
 
 
@@ -156,8 +155,6 @@ class Faults:
     def _check(self, hit: Hit) -> None:
         if hit.fault.on == "daemon" and self.companions[hit.craft].process is None:
             raise ScenarioError(f"faults[{hit.index}]: expected --check, which starts the daemon, for {hit.fault.what}")
-        if hit.fault.what == "gps":
-            raise ScenarioError(f"faults[{hit.index}]: what: expected another, no autopilot here can lose its position")
         if hit.fault.what == "rc":
             switch_command(self._flight.crafts[hit.craft], _mode_of(hit.fault))  # raises for a mode that is none
 
