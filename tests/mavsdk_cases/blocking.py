@@ -83,10 +83,11 @@ def blocking_version(system: Any) -> None:
     assert info.get_product().vendor_id > 0
 
 
-@case(AIR, speed=3.0, blocking=True)
+@case(AIR, speed=2.0, blocking=True)
 def blocking_offboard_flies(system: Any) -> None:
     """Offboard: a setpoint, a stream, start; the position is flown to; stop is Hold."""
     offboard, telemetry = Offboard(system), Telemetry(system)
+    Param(system).set_param_float("COM_OF_LOSS_T", 5.0)  # of vehicle time; MAVSDK streams in wall time
     offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
     with updates(telemetry, "attitude_quaternion") as attitude:
         began_us = attitude(lambda q: True).timestamp_us

@@ -20,6 +20,7 @@ from mavsdk.asyncio.plugins.offboard import OffboardAsync
 from mavsdk.asyncio.plugins.param import ParamAsync
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavsdk.exceptions import MavsdkError
+from mavsdk.plugins.offboard import OffboardError, OffboardResult
 
 LIMIT_S = 12.0  # of wall time for one wait, against every peer
 M_PER_DEG = 111_320.0  # of latitude
@@ -225,12 +226,23 @@ class Drone:
 
         await self.poll(over)
 
-    async def offboard_with(self, *setpoints: Awaitable[None]) -> None:
-        """Offboard once the autopilot has seen a second of the stream, as PX4's guide asks for."""
-        for each in setpoints:
-            await each
-        await self.elapsed(1.2)
-        await self.offboard.start()
+    async def offboard_with(self, setpoint: Awaitable[None], *, loss_s: float = 5.0) -> None:
+        """Offboard, once the autopilot has seen enough of the stream; ``loss_s`` of vehicle time without it are borne,
+        since MAVSDK streams in wall time."""
+        await self.param.set_param_float("COM_OF_LOSS_T", loss_s)
+        await setpoint
+        await self.elapsed(1.0)
+
+        async def granted() -> bool:
+            try:
+                await self.offboard.start()
+            except OffboardError as error:
+                if error.result is OffboardResult.COMMAND_DENIED:
+                    return False
+                raise
+            return True
+
+        await self.poll(granted)
         await self.mode("OFFBOARD")
 
 

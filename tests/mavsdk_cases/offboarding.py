@@ -140,8 +140,7 @@ async def is_active_ends_when_another_mode_takes_over(drone: Drone) -> None:
 async def a_stream_that_stops_is_a_failsafe(drone: Drone) -> None:
     """COM_OF_LOSS_T and COM_OBL_RC_ACT = 5: Hold by itself, and a STATUSTEXT that says so."""
     await drone.param.set_param_int("COM_OBL_RC_ACT", 5)
-    await drone.param.set_param_float("COM_OF_LOSS_T", 0.5)
-    await drone.offboard_with(drone.offboard.set_velocity_ned(VelocityNedYaw(0.5, 0.0, 0.0, 0.0)))
+    await drone.offboard_with(drone.offboard.set_velocity_ned(VelocityNedYaw(0.5, 0.0, 0.0, 0.0)), loss_s=1.5)
     texts = drone.telemetry.subscribe_status_text()
     async with (
         drone.expecting(texts, lambda text: "offboard" in text.text.lower()),
