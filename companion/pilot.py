@@ -261,7 +261,8 @@ class Pilot:
         if inputs.task is not self._task:
             self._task, self._anchor = inputs.task, None
         config, limit = self._config.policy, self._config.reference_limit_m_s2
-        p, v = inputs.vehicle.p_enu, inputs.vehicle.v_enu
+        p_act, v_act = self._unwound(p_act, v_act)
+        p, v = self._unwound(inputs.vehicle.p_enu, inputs.vehicle.v_enu)
         if inputs.task is Task.STAY:
             return frozen(brake(v_act, config, limit)), True
         if inputs.task is Task.HOLD:
@@ -278,6 +279,19 @@ class Pilot:
         if action is None:
             return frozen(brake(v_act, config, limit)), False
         return frozen(np.clip(action, -limit, limit)), True
+
+    def _unwound(self, p: Vec3, v: Vec3) -> tuple[Vec3, Vec3]:
+        """Position and velocity once the last command has been slewed to zero: where a reference law can next choose.
+
+        t = |a| / slew on each axis, v += a t / 2, p += v t + a t^2 / 3. The laws know no slew and take the acceleration
+        for theirs at once; behind a slow one (ArduPilot's 5 m/s^3) they would turn late and circle their target.
+        """
+        slew = self._config.limits.slew_m_s3
+        if slew is None or not self._commands:
+            return p, v
+        a = self._commands[-1][1]
+        t = np.abs(a) / slew
+        return p + v * t + a * t * t / 3.0, v + 0.5 * a * t
 
     def _ask(self, v_enu: Vec3, error_enu: Vec3) -> Vec3 | None:
         """The policy's acceleration, None where its output is not usable."""

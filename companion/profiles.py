@@ -7,9 +7,9 @@ running stream only; ArduPilot is sent nothing until EXTENDED_SYS_STATE says IN_
 cancels it and leaves the climb. Both are engaged only in the air.
 
 Predictor: a setpoint acts ``actuation_lag_s`` after the state it answers, as dead time. ArduPilot shapes acceleration
-setpoints with PSC_JERK_XY (5 m/s^3): what changes faster is followed late, so the profile's ``slew_m_s3`` keeps
-setpoints within it where ``limits.slew_m_s3`` is not set; the rest of its answer (0.06 s level, 0.13 to 0.20 s
-vertical, first velocity 0.21 s after a step) is the dead time.
+setpoints with PSC_JERK_XY (5 m/s^3 of the level vector's length, so 3.5 of each axis): what changes faster is followed
+late, so the profile's ``slew_m_s3`` keeps setpoints within it where ``limits.slew_m_s3`` is not set; the rest of its
+answer (0.06 s level, 0.13 to 0.20 s vertical, first velocity 0.21 s after a step) is the dead time.
 
 Confirmation: POSITION_TARGET_LOCAL_NED repeats what the autopilot follows, under a mask of its own making. ArduPilot
 writes the mask of its guided submode, yaw always ignored; PX4 marks the numbers that are not finite after its position
@@ -113,7 +113,7 @@ PROFILES: dict[str, Profile] = {
             hold=_ARDU_BRAKE,
             actuation_lag_s=0.21,
             response_lag_s=0.13,
-            slew_m_s3=5.0,
+            slew_m_s3=3.5,
             streams_when_ready=False,
             engage_by="command",
             echo_bits=ECHO_AXES,

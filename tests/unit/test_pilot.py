@@ -329,3 +329,21 @@ def test_a_pilot_configured_anew_flies_as_one_made_so() -> None:
     for one, other in zip(fly(early.configured(late), 20), fly(made, 20), strict=True):
         np.testing.assert_array_equal(one.wire, other.wire)
         assert one.prediction.start_ns == other.prediction.start_ns
+
+
+@pytest.mark.parametrize("goal", [[1.5, 0.0, 2.0], [3.0, 0.0, 2.0], [-4.0, 3.0, 3.0]])
+def test_behind_a_slow_slew_it_arrives_and_stays(goal: list[float]) -> None:
+    """A vehicle that follows by the jerk of ArduPilot's default, 5 m/s^3 of the level vector, and of the vertical."""
+    brain = Pilot(parse_config({"vehicle": {"profile": "ardupilot"}, "delay": {"loop_s": 0.0, "actuation_s": 0.02}}))
+    p, v, a = np.array([0.0, 0.0, 2.0]), np.zeros(3), np.zeros(3)
+    farthest_m = 0.0
+    for k in range(500):
+        state = VehicleState(k * 20_000_000, frozen(p), frozen(v))
+        asked = brain.step(PilotInput(vehicle=state, target_enu=frozen(goal))).wire
+        change = asked - a
+        change[:2] *= min(1.0, 0.1 / max(float(np.linalg.norm(change[:2])), 1e-9))
+        a = a + np.array([change[0], change[1], np.clip(change[2], -0.1, 0.1)])
+        p, v = p + v * 0.02 + a * 2e-4, v + a * 0.02
+        if k >= 250:
+            farthest_m = max(farthest_m, float(np.linalg.norm(p - goal)))
+    assert farthest_m < 0.05

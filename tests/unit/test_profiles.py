@@ -64,10 +64,10 @@ def test_auto_takes_ardupilot_from_its_heartbeat() -> None:
         await world.run(5.0)
         assert world.state == "READY"
         config = world.session.config
-        assert (config.vehicle.profile, config.engage_by, config.limits.slew_m_s3) == ("ardupilot", "command", 5.0)
+        assert (config.vehicle.profile, config.engage_by, config.limits.slew_m_s3) == ("ardupilot", "command", 3.5)
         pilot = world.service._thinker._pilot
         assert pilot._delay_ns == 210_000_000
-        assert pilot._config.limits.slew_m_s3 == 5.0
+        assert pilot._config.limits.slew_m_s3 == 3.5
         await flown(world)
         await world.run(1.0)
 
@@ -306,7 +306,7 @@ def test_velocity_goes_with_the_acceleration_where_asked(peer: Px4 | ArduCopter,
 def test_profile_defaults_give_way_to_the_file() -> None:
     config = parse_config({"vehicle": {"profile": "ardupilot"}, "limits": {"slew_m_s3": 9.0}, "tick_hz": 25})
     assert (config.limits.slew_m_s3, config.rate_hz) == (9.0, 25)
-    assert parse_config({"vehicle": {"profile": "ardupilot"}}).limits.slew_m_s3 == 5.0
+    assert parse_config({"vehicle": {"profile": "ardupilot"}}).limits.slew_m_s3 == 3.5
     assert parse_config({"vehicle": {"profile": "px4"}}).limits.slew_m_s3 is None
     auto = parse_config({"vehicle": {"profile": "auto"}})
     assert auto.limits.slew_m_s3 is None
