@@ -282,7 +282,7 @@ def test_ardupilot_setpoints_keep_within_its_jerk_limit() -> None:
     play(script, peer, target={"position": [8.0, 0.0, 2.0]}, disturbance={"enabled": False})
     a = np.array([[m.afx, m.afy, m.afz] for *_, m in peer.taken])
     assert np.abs(a).max() > 1.0
-    assert np.abs(np.diff(a, axis=0)).max() <= 5.0 * 0.02 + 1e-6
+    assert np.abs(np.diff(a, axis=0)).max() <= 3.5 * 0.02 + 1e-6
 
 
 @pytest.mark.parametrize(("peer", "mask"), [(Px4(), 0x0C07), (ArduCopter(), 0x0407)])

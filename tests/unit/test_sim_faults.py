@@ -182,7 +182,6 @@ def test_a_sources_clock_and_its_frames() -> None:
     [
         ({"what": "kill", "on": "daemon", "at_tick": 0}, "faults[0]: expected --check"),
         ({"what": "rc", "on": "autopilot", "at_tick": 0, "value": "SWIM"}, "SWIM"),
-        ({"what": "gps", "on": "autopilot", "at_tick": 0}, "no autopilot here can lose its position"),
     ],
 )
 def test_what_cannot_be_done_is_refused_before_the_flight(fault: dict[str, Any], named: str) -> None:
