@@ -146,7 +146,7 @@ class Craft:
         t_ns = self.t_ns
         for sensor in self.sensors.values():
             if t_ns >= sensor.next_ns:
-                sensor.sample(t_ns, self._surroundings())
+                sensor.sample(t_ns, self._surroundings(), self.truth)
         self._sense_ns = min((sensor.next_ns for sensor in self.sensors.values()), default=_NEVER_NS)
 
     def control(self) -> tuple[Reply, ...]:

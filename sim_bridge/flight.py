@@ -18,7 +18,7 @@ from sim_bridge.physics import Start, World
 from sim_bridge.placement import Resolved
 from sim_bridge.scenario import Scenario, Vehicle
 from sim_bridge.scenario_world import EstimatorNoise, Imu, Physics
-from sim_bridge.sensors import Sensor
+from sim_bridge.sensors import Sensor, sensor_of
 
 _GUSTS, _ESTIMATOR = 0, 1  # effects that draw
 _INTEGRAL_HZ2 = 2.0  # PX4's MPC_Z_VEL_I_ACC
@@ -79,16 +79,7 @@ class Flight:
     def _sensors(self, vehicle: int, ids: list[str], radii_m: list[float]) -> dict[str, Sensor]:
         scenario = self.resolved.scenario
         return {
-            spec.source: Sensor(
-                ids,
-                radii_m,
-                rate_hz=spec.rate_hz,
-                sigma_m=spec.sigma_m,
-                latency_s=spec.latency_s,
-                dropout=spec.dropout,
-                frame_dropout=spec.frame_dropout,
-                rng=self.resolved.sensor_rng(index, vehicle),
-            )
+            spec.source: sensor_of(spec, ids, radii_m, self.resolved.sensor_rng(index, vehicle))
             for index, spec in scenario.carried(scenario.fleet[vehicle].name)
         }
 

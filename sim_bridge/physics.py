@@ -22,6 +22,7 @@ from sim_bridge.body import Body, BodyState, Start, to_body
 from sim_bridge.crazyflie import Crazyflie, Quad, Triple
 from sim_bridge.errors import ScenarioError
 from sim_bridge.obstacles import Motion, Point
+from sim_bridge.pursuit import Reacting
 from sim_bridge.scenario_world import Physics
 
 __all__ = ["BodyState", "Start", "World", "control_steps", "to_body"]
@@ -81,6 +82,9 @@ class World:
         _check_starts(vehicles, starts)
         self.vehicles = tuple(vehicles)
         self.motions = tuple(motions)
+        self._reacting = tuple(motion for motion in self.motions if isinstance(motion, Reacting))
+        for motion in self._reacting:
+            motion.reset()
         self.radii_m = tuple(float(radius_m) for radius_m in radii_m)
         self.physics_hz = physics_hz
         self.step_count = 0
@@ -148,6 +152,8 @@ class World:
         pybullet.stepSimulation(self._client)
         self.step_count += 1
         if self._motions_from_step is not None:
+            for motion in self._reacting:
+                motion.advance(1.0 / self.physics_hz, self.states)  # as they were when the step began
             self._move_obstacles()
         if self.step_count % self._battery_steps == 0:
             self._discharge()

@@ -40,7 +40,7 @@ class Resolved:
 
     def physics_rng(self, effect: int, vehicle: int) -> np.random.Generator:
         """The generator of a random effect of the physics (0 gusts, 1 estimator) on vehicle ``vehicle``."""
-        return np.random.default_rng([self.seed, 2, effect, vehicle])
+        return np.random.default_rng([self.seed, 3, effect, vehicle])
 
 
 def resolve(name: str, scenario: Scenario, seed: int, *, obstacles: bool = True) -> Resolved:

@@ -19,6 +19,7 @@ from msgspec import Meta
 from sim_bridge.errors import ScenarioError
 from sim_bridge.physics import control_steps
 from sim_bridge.scenario_checks import check
+from sim_bridge.scenario_errors import pointed
 from sim_bridge.scenario_faults import Expectation, Fault
 from sim_bridge.scenario_obstacles import (
     AcceleratedObstacle,
@@ -211,7 +212,7 @@ def parse_scenario(raw: Mapping[str, Any], *, source: str) -> Scenario:
     try:
         scenario = msgspec.convert(_numbered(raw), Scenario)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{source}: {_pointed(str(error))}") from None
+        raise ScenarioError(f"{source}: {pointed(str(error), Scenario)}") from None
     for key, value in _numbers(raw, ""):
         if not math.isfinite(value):
             raise ScenarioError(f"{source}: {key}: expected a finite number, got {value}")
@@ -258,13 +259,6 @@ def _with_files_beside(scenario: Scenario, folder: Path) -> Scenario:
         for o in scenario.obstacles
     )
     return scenario if obstacles == scenario.obstacles else msgspec.structs.replace(scenario, obstacles=obstacles)
-
-
-def _pointed(message: str) -> str:
-    """``Expected `float`... - at `$.end.reach_m` `` -> ``end.reach_m: Expected `float`...``."""
-    text, _, path = message.rpartition(" - at `$")
-    key = path.rstrip("`").lstrip(".")
-    return f"{key}: {text}" if text and key else text or message
 
 
 def _numbers(value: Any, key: str) -> list[tuple[str, float]]:

@@ -19,7 +19,7 @@ from sim_bridge.sensors import Frame
 
 
 class ObstacleOut(msgspec.Struct, frozen=True):
-    id: str
+    id: str | None  # None: anonymous
     position: tuple[float, float, float]
     radius: float
     position_std: float

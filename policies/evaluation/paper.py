@@ -24,7 +24,7 @@ from policies.env import PRESETS, FloatArray
 from policies.evaluation.bullet import PERIOD_S, Arrival, BulletVehicle
 from sim_bridge.placement import resolve
 from sim_bridge.scenario import BUILTIN, Scenario, load_scenario
-from sim_bridge.sensors import Frame, Sensor
+from sim_bridge.sensors import Frame, Sensor, Sighting
 
 PresetName = Literal["paper", "default"]
 PRESET_NAMES: tuple[PresetName, ...] = ("paper", "default")
@@ -141,7 +141,7 @@ class _PilotLaw:
         self.verdicts[out.result.verdict.value] += 1
         return out.wire
 
-    def _frame(self, stamp_ns: int, sightings: list[tuple[str, tuple[float, float, float], float]]) -> DetectionFrame:
+    def _frame(self, stamp_ns: int, sightings: list[Sighting]) -> DetectionFrame:
         self._sequence += 1
         detections = tuple(Detection(id=name, p_enu=frozen(p), radius_m=radius_m) for name, p, radius_m in sightings)
         return DetectionFrame(stamp_ns, "sim", self._sequence, DetectionKind.DETECTION, detections)

@@ -11,11 +11,24 @@ import pytest
 
 from sim_bridge.cli import main
 from sim_bridge.errors import ScenarioError
-from sim_bridge.obstacles import Accelerated, FigureEight, Linear, Static
+from sim_bridge.obstacles import AWAY_ENU, Accelerated, Circle, FigureEight, Linear, Static, Timed
+from sim_bridge.paths import Polyline, Spline
 from sim_bridge.placement import describe, resolve
+from sim_bridge.pursuit import Pursuit
 from sim_bridge.scenario import Scenario, load_scenario, parse_scenario
 
 LINEAR = {"id": "a", "motion": "linear", "cross_point": [1.0, 2.0, 3.0], "cross_at_s": 2.0, "velocity": [1.0, 0.0, 0.5]}
+CIRCLE = {"id": "o", "motion": "circle", "origin": [0.0, 0.0, 2.0], "radius_path_m": 2.0, "period_s": 8.0}
+WAY = {
+    "id": "w",
+    "motion": "waypoints",
+    "points": [[0.0, 0.0, 1.0], [2.0, 0.0, 1.0], [2.0, 2.0, 1.0]],
+    "speed_m_s": 1.0,
+}
+CURVE = {"id": "s", "motion": "spline", "points": WAY["points"], "times_s": [0.0, 2.0, 5.0]}
+CHASE = {"id": "p", "motion": "pursuit", "origin": [5.0, 0.0, 1.0], "speed_m_s": 2.0, "accel_m_s2": 3.0}
+FAULT = {"what": "drop", "on": "onboard", "at_s": 1.0}
+TWO = [{"name": "a"}, {"name": "b"}]
 EIGHT = {"id": "e", "motion": "figure_eight", "origin": [0.0, 0.0, 2.0], "size_m": 2.0, "period_s": 8.0}
 
 
@@ -83,6 +96,48 @@ def test_the_demo_is_what_it_says() -> None:
         ({"operator": [{"do": "arm", "at_tick": 1, "after": "airborne_hover"}]}, "operator[0]"),
         ({"operator": [{"do": "dance", "at_tick": 1}]}, "operator[0].do"),
         ({"end": {"timeout_s": -1.0}}, "end.timeout_s"),
+        ({"vehicle": {}, "vehicles": [{}]}, "vehicles: expected [vehicle] or [[vehicles]]"),
+        ({"vehicles": [{}, {"name": "uav1"}]}, "uav1 twice"),
+        ({"vehicles": [{}, {"system_id": 1}]}, "system_id 1 twice"),
+        ({"vehicles": [{"gcs_port": 5000}, {"onboard_port": 5000}]}, "port 5000 twice"),
+        ({"vehicles": [{}, 3]}, "vehicles[1]"),
+        ({"vehicle": {"system_id": 0}}, "vehicle.system_id"),
+        ({"vehicle": {"personality": "betaflight"}}, "vehicle.personality: expected one of ardupilot, px4, got"),
+        ({"vehicle": {"parameters": {"lower": 1}}}, "vehicle.parameters"),
+        ({"vehicle": {"daemon": {"safety": {}}}}, "vehicle.daemon"),
+        ({"vehicle": {"name": "a"}, "obstacles": [LINEAR]}, "a twice"),
+        ({"obstacles": [{**CIRCLE, "period_s": 0.0}]}, "obstacles[0].period_s"),
+        ({"obstacles": [{**WAY, "points": WAY["points"][:1]}]}, "obstacles[0].points"),
+        ({"obstacles": [{**WAY, "points": [[0, 0, 1], [0, 0, 1]]}]}, "obstacles[0]: points: expected consecutive"),
+        ({"obstacles": [{**CURVE, "times_s": [0.0, 1.0]}]}, "obstacles[0]: times_s: expected 3 times"),
+        ({"obstacles": [{**CURVE, "times_s": [0.0, 1.0, 1.0]}]}, "obstacles[0]: times_s: expected rising"),
+        ({"obstacles": [{**CHASE, "of": "uav9"}]}, "obstacles[0].of: expected one of uav1, got uav9"),
+        ({"obstacles": [{**CHASE, "velocity": [3.0, 0.0, 0.0]}]}, "velocity: expected at most speed_m_s 2.0"),
+        ({"obstacles": [{**LINEAR, "start_s": 2.0, "end_s": 2.0}]}, "end_s: expected later than start_s"),
+        ({"sensors": [{"source": "world"}]}, "sensors[0]: source"),
+        ({"sensors": [{"clutter": 1.0}]}, "sensors[0]: clutter: expected range_m or clutter_box"),
+        ({"sensors": [{"fov_deg": 0.0}]}, "sensors[0].fov_deg"),
+        ({"vehicles": TWO, "sensors": [{"vehicles": ["c"]}]}, "sensors[0].vehicles: expected one of a, b, got c"),
+        ({"vehicles": TWO, "operator": [{"do": "arm", "at_tick": 0, "vehicle": "c"}]}, "operator[0].vehicle"),
+        (
+            {"physics": {"wind": {"gusts": "strong"}}},
+            "physics.wind.gusts: expected one of light, moderate, none, severe",
+        ),
+        ({"physics": {"battery_start": 1.1}}, "physics.battery_start"),
+        ({"faults": [{**FAULT, "what": "explode"}]}, "faults[0].what: expected one of"),
+        ({"faults": [{**FAULT, "at_tick": 3}]}, "faults[0]: expected exactly one of at_s and at_tick"),
+        ({"faults": [{**FAULT, "on": "lidar"}]}, "faults[0]: on: expected one of onboard, ground, obstacles, sim"),
+        ({"faults": [{**FAULT, "what": "kill"}]}, "faults[0]: on: expected one of daemon, autopilot for kill"),
+        ({"faults": [{**FAULT, "what": "kill", "on": "daemon", "for_s": 1.0}]}, "faults[0]: for_s"),
+        ({"faults": [{**FAULT, "what": "cut", "share": 0.5}]}, "faults[0]: share"),
+        ({"faults": [{**FAULT, "what": "delay"}]}, "faults[0]: value: expected a delay above 0 s"),
+        ({"faults": [{**FAULT, "value": 1.0}]}, "faults[0]: value: expected none for drop"),
+        ({"faults": [{**FAULT, "what": "gust", "on": "world", "value": 2.0}]}, "expected a wind [east, north, up]"),
+        ({"faults": [{**FAULT, "what": "battery", "on": "autopilot", "value": 1.5}]}, "a state of charge, 0 to 1"),
+        ({"faults": [{**FAULT, "vehicle": "b"}]}, "faults[0]: vehicle: expected one of uav1, got b"),
+        ({"faults": [{**FAULT, "expect": {"state": "DONE"}}]}, "faults[0].expect.state: expected one of ACTIVE, FAULT"),
+        ({"expect": {"never_state": ["NONE"]}}, "expect.never_state"),
+        ({"expect": {"final_mode": "hold"}}, "expect.final_mode"),
     ],
 )
 def test_refusals_are_one_line_that_names_file_and_key(changes: dict[str, Any], named: str) -> None:
@@ -148,6 +203,96 @@ def test_jitter_stays_within_its_bounds_and_belongs_to_the_seed() -> None:
     assert 25.0 < max(headings) <= 30.0
     assert max(abs(x - 1.0) for x in xs) <= 0.7 + 1e-9
     assert max(abs(x - 1.0) for x in xs) > 0.5
+
+
+def test_every_new_motion_passes_its_crossing_point_in_time(tmp_path: Path) -> None:
+    (tmp_path / "flown.csv").write_text("t_s,x,y,z\n0,0,0,1\n3,3,0,1\n5,3,4,1\n")
+    crossing = {"cross_point": [1.0, 2.0, 3.0], "cross_at_s": 2.5, "jitter": {"yaw_deg": 40.0}}
+    circle = {k: v for k, v in CIRCLE.items() if k != "origin"} | crossing
+    track = {"motion": "track", "file": "flown.csv", **crossing}
+    scenario = parse_scenario(
+        {
+            "obstacles": [
+                {**circle, "cross_phase_deg": 30.0, "tilt_deg": 50.0},
+                {**circle, "id": "c", "clockwise": True},
+                {**WAY, **crossing},
+                {**CURVE, **crossing},
+                {**track, "id": "t1"},
+                {**track, "id": "t2", "interpolation": "cubic", "start_s": 1.0},
+            ]
+        },
+        source=str(tmp_path / "file.toml"),
+    )
+    for seed in range(5):
+        motions = [o.motion for o in resolve("x", scenario, seed).obstacles]
+        assert [type(m) for m in motions] == [Circle, Circle, Polyline, Spline, Polyline, Timed]
+        for motion in motions:
+            assert motion.position(2.5) == pytest.approx((1.0, 2.0, 3.0), abs=1e-12)
+    assert motions[5].position(0.9) == AWAY_ENU
+
+
+def test_paths_stand_where_they_are_written_or_shifted_by_their_origin() -> None:
+    scenario = parsed(
+        obstacles=[
+            WAY,
+            {**WAY, "id": "o", "origin": [10.0, 0.0, 0.5]},
+            {**WAY, "id": "j", "jitter": {"yaw_deg": 90.0}},
+        ]
+    )
+    written, shifted, turned = (o.motion for o in resolve("x", scenario, 3).obstacles)
+    assert written.position(1.0) == (1.0, 0.0, 1.0)
+    assert shifted.position(1.0) == (11.0, 0.0, 1.5)
+    assert turned.position(0.0) == pytest.approx((0.0, 0.0, 1.0))  # it turns about its first point
+    x, y, z = turned.position(1.0)
+    assert math.hypot(x, y) == pytest.approx(1.0)
+    assert abs(y) > 0.05
+    assert z == 1.0
+
+
+def test_a_late_obstacle_appears_a_drawn_time_earlier_or_later() -> None:
+    scenario = parsed(obstacles=[{**EIGHT, "start_s": 2.0, "end_s": 9.0, "jitter": {"time_s": 0.5}}])
+    starts = []
+    for seed in range(50):
+        (obstacle,) = resolve("x", scenario, seed).obstacles
+        assert isinstance(obstacle.motion, Timed)
+        starts.append(obstacle.motion.start_s)
+        assert obstacle.motion.end_s == 9.0
+    assert 1.5 <= min(starts) < 1.7
+    assert 2.3 < max(starts) <= 2.5
+
+
+def test_a_pursuit_is_of_the_vehicle_that_it_names() -> None:
+    scenario = parsed(vehicles=TWO, obstacles=[CHASE, {**CHASE, "id": "q", "of": "b", "start_s": 1.0}])
+    first, second = (o.motion for o in resolve("x", scenario, 0).obstacles)
+    assert isinstance(first, Pursuit)
+    assert isinstance(second, Pursuit)
+    assert (first.target, second.target) == (0, 1)
+    assert first.position(0.0) == (5.0, 0.0, 1.0)
+    assert second.position(0.0) == AWAY_ENU
+
+
+def test_a_fleet_is_numbered_and_the_vehicle_is_its_first() -> None:
+    scenario = parsed(
+        vehicles=[{"start": [1, 0, 0.2]}, {"target": [0, 0, 2]}, {"name": "x", "system_id": 9}],
+        target={"position": [5, 0, 1]},
+        sensors=[{"source": "s"}, {"source": "t", "vehicles": ["uav2", "x"]}],
+    )
+    assert [(v.name, v.system_id) for v in scenario.fleet] == [("uav1", 1), ("uav2", 2), ("x", 9)]
+    assert scenario.vehicle == scenario.fleet[0]
+    assert [scenario.target_of(v) for v in scenario.fleet] == [(5, 0, 1), (0, 0, 2), (5, 0, 1)]
+    assert [[s.source for _, s in scenario.carried(v.name)] for v in scenario.fleet] == [["s"], ["s", "t"], ["s", "t"]]
+    assert [i for i, _ in scenario.carried("x")] == [0, 1]
+    assert parsed().fleet == (parsed().vehicle,)
+    told = describe(resolve("x", scenario, 0), "uav1")["fleet"]
+    assert [one["prefix"] for one in told] == ["uav/uav1", "uav/uav2", "uav/x"]
+    assert told[1]["sources"] == ["s", "t"]
+
+
+def test_each_vehicle_has_its_own_draws() -> None:
+    resolved = resolve("x", parsed(vehicles=TWO), 4)
+    first, second = resolved.sensor_rng(0, 0), resolved.sensor_rng(0, 1)
+    assert first.random() == resolved.sensor_rng(0).random()  # as where there is one
+    assert resolved.sensor_rng(0).random() != second.random()
 
 
 def test_without_obstacles_and_description() -> None:
