@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from sim_bridge.controller import AccelerationSetpoint, AttitudeSetpoint, MotorsOff, Setpoint
+from sim_bridge.controller import AccelerationSetpoint, MotorsOff, Setpoint
 from sim_bridge.messages import (
     NS_PER_S,
     AttitudeTarget,
@@ -38,7 +38,7 @@ from sim_bridge.px4.position import FREE, PositionControl, Trajectory
 from sim_bridge.px4.rates import ground_rates_hz, onboard_rates_hz
 from sim_bridge.px4.sticks import ManualControl
 from sim_bridge.rotation import from_euler
-from sim_bridge.setpoints import ATTITUDE_IGNORED, THRUST_IGNORED, YAW_TURN_IGNORED
+from sim_bridge.setpoints import echo, flown_attitude
 from sim_bridge.stream import SetpointStream
 
 HOVER_NS = NS_PER_S // 2
@@ -106,6 +106,8 @@ class Autopilot:
         )
         self._commands = Commands(self._commander, self._navigator)
         self._flown_mode = Mode.HOLD
+        self._accelerated = AccelerationSetpoint((0.0, 0.0, 0.0))  # kept while it is the same: it is asked for often
+        self._tilt_deg = math.nan
         self._hover_since_ns: int | None = None
         if airborne:
             self._navigator.hold(start_enu)
@@ -163,7 +165,7 @@ class Autopilot:
         if mode is not self._flown_mode:
             self._flown_mode = mode
             self._manual.enter(state)
-        if not self.armed or self._commander.terminated:
+        if not self._commander.armed or self._commander.terminated:
             return MotorsOff()
         if mode is Mode.OFFBOARD and self._stream.wanted is not None:
             return self._offboard(self._stream.wanted, state)
@@ -176,11 +178,8 @@ class Autopilot:
 
     def turn(self, dt_s: float) -> None:
         """One physics step has passed: headings follow yaw rates, integrals and sticks go on."""
-        if self.airborne:
-            self._control.integrate(dt_s)
-        else:
-            self._control.reset()
         mode, wanted = self._commander.mode, self._stream.wanted
+        self._control.integrate(dt_s)
         if mode is Mode.OFFBOARD and isinstance(wanted, Trajectory):
             if math.isfinite(wanted.yaw_rad):
                 self._navigator.yaw_rad = wanted.yaw_rad
@@ -199,7 +198,7 @@ class Autopilot:
 
     def _offboard(self, wanted: Trajectory | AttitudeTarget, state: BodyState) -> Setpoint:
         if isinstance(wanted, AttitudeTarget):
-            return _attitude(wanted)
+            return flown_attitude(wanted)
         return self._accelerate(self._control.update(wanted, state))
 
     def _by_sticks(self, mode: Mode, state: BodyState) -> Setpoint:
@@ -210,10 +209,14 @@ class Autopilot:
         return MotorsOff() if not self.airborne and not self._lifts(setpoint.thrust) else setpoint
 
     def _accelerate(self, a_enu: Vec3) -> Setpoint:
-        if not self.airborne and a_enu[2] < LIFT_OFF_M_S2:
+        if a_enu[2] < LIFT_OFF_M_S2 and not self.airborne:
+            self._control.relax()
             return MotorsOff()
-        tilt_tan = math.tan(math.radians(float(self.parameters["MPC_TILTMAX_AIR"])))
-        return AccelerationSetpoint(a_enu, self._navigator.yaw_rad, tilt_tan)
+        tilt_deg, yaw_rad, last = float(self.parameters["MPC_TILTMAX_AIR"]), self._navigator.yaw_rad, self._accelerated
+        if a_enu is not last.a_enu or yaw_rad != last.yaw_rad or tilt_deg != self._tilt_deg:
+            self._tilt_deg = tilt_deg
+            last = self._accelerated = AccelerationSetpoint(a_enu, yaw_rad, math.tan(math.radians(tilt_deg)))
+        return last
 
     def _to_goal(self, mode: Mode, state: BodyState) -> Setpoint:
         goal = self._navigator.target(state)
@@ -327,9 +330,9 @@ class Autopilot:
             if isinstance(wanted, AttitudeTarget):
                 return None
             rate = wanted.yaw_rate_rad_s if math.isfinite(wanted.yaw_rate_rad_s) else 0.0
-            return _echo(wanted.p_enu, self._control.v_enu, self._control.a_enu, yaw_rad, rate)
+            return echo(wanted.p_enu, self._control.v_enu, self._control.a_enu, yaw_rad, rate)
         goal = self._navigator.goal
-        return None if goal is None else _echo(goal.p_enu, FREE, FREE, goal.yaw_rad, 0.0)
+        return None if goal is None else echo(goal.p_enu, FREE, FREE, goal.yaw_rad, 0.0)
 
     def attitude_target(self) -> AttitudeTarget | None:
         """The attitude or rates that are flown, None where the position loops fly."""
@@ -339,18 +342,3 @@ class Autopilot:
     def rates_hz(self, link: LinkName) -> Mapping[int, float]:
         """What streams unasked on ``link``."""
         return onboard_rates_hz(self._control_hz) if link is LinkName.ONBOARD else ground_rates_hz()
-
-
-def _attitude(wanted: AttitudeTarget) -> AttitudeSetpoint:
-    mask = wanted.type_mask
-    thrust = 0.0 if mask & THRUST_IGNORED else wanted.thrust
-    turn = 0.0 if mask & YAW_TURN_IGNORED else wanted.omega_flu[2]
-    if mask & ATTITUDE_IGNORED:
-        return AttitudeSetpoint(None, thrust, (wanted.omega_flu[0], wanted.omega_flu[1], turn))
-    return AttitudeSetpoint(wanted.q_wxyz, thrust, (0.0, 0.0, turn))
-
-
-def _echo(p_enu: Vec3, v_enu: Vec3, a_enu: Vec3, yaw_rad: float, yaw_rate_rad_s: float) -> LocalSetpoint:
-    # the mask's bits are north, east, down; ENU is east, north, up: horizontally both are free, or neither
-    mask = sum(1 << i for i, x in enumerate((*p_enu, *v_enu, *a_enu)) if math.isnan(x))
-    return LocalSetpoint(0, 1, mask, p_enu, v_enu, a_enu, yaw_rad, yaw_rate_rad_s)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+from sim_bridge.controller import AttitudeSetpoint
 from sim_bridge.messages import HOME_ALTITUDE_AMSL_M, AttitudeTarget, LocalSetpoint, Vec3
 from sim_bridge.physics import BodyState
 from sim_bridge.px4.position import FREE, Trajectory
@@ -75,6 +76,23 @@ def attitude_refusal(setpoint: AttitudeTarget) -> str:
         return "not a finite number"
     norm = math.hypot(*setpoint.q_wxyz)
     return "" if mask & ATTITUDE_IGNORED or abs(norm - 1.0) < 0.1 else "no unit quaternion"
+
+
+def flown_attitude(wanted: AttitudeTarget) -> AttitudeSetpoint:
+    """What an accepted attitude or rate setpoint asks of the controller; an ignored thrust is none, as on PX4."""
+    mask = wanted.type_mask
+    thrust = 0.0 if mask & THRUST_IGNORED else wanted.thrust
+    turn = 0.0 if mask & YAW_TURN_IGNORED else wanted.omega_flu[2]
+    if mask & ATTITUDE_IGNORED:
+        return AttitudeSetpoint(None, thrust, (wanted.omega_flu[0], wanted.omega_flu[1], turn))
+    return AttitudeSetpoint(wanted.q_wxyz, thrust, (0.0, 0.0, turn))
+
+
+def echo(p_enu: Vec3, v_enu: Vec3, a_enu: Vec3, yaw_rad: float, yaw_rate_rad_s: float) -> LocalSetpoint:
+    """What is flown as POSITION_TARGET_LOCAL_NED: NaN and a bit of the mask for what is free."""
+    # the mask's bits are north, east, down; ENU is east, north, up: horizontally both are free, or neither
+    mask = sum(1 << i for i, x in enumerate((*p_enu, *v_enu, *a_enu)) if math.isnan(x))
+    return LocalSetpoint(0, 1, mask, p_enu, v_enu, a_enu, yaw_rad, yaw_rate_rad_s)
 
 
 def _given(setpoint: LocalSetpoint) -> Trajectory:

@@ -50,23 +50,37 @@ class PositionControl:
         self._parameters = parameters
         self._integral = [0.0, 0.0, 0.0]  # [m/s^2]
         self._error = [0.0, 0.0, 0.0]
+        self._runs = False  # there is an error to integrate
+        self._wanted: Trajectory | None = None  # the last, and whether it is an acceleration alone
+        self._accelerates = False
         self.v_enu: Vec3 = FREE  # what was last asked for
         self.a_enu: Vec3 = (0.0, 0.0, 0.0)
 
     def reset(self) -> None:
         """Forget the integral and what was asked for."""
-        self._integral = [0.0, 0.0, 0.0]
-        self._error = [0.0, 0.0, 0.0]
+        self._stop()
         self.v_enu = FREE
         self.a_enu = (0.0, 0.0, 0.0)
 
+    def relax(self) -> None:
+        """It stands on the ground: errors are no disturbances."""
+        self._integral = [0.0, 0.0, 0.0]
+
+    def _stop(self) -> None:
+        self._integral = [0.0, 0.0, 0.0]
+        self._error = [0.0, 0.0, 0.0]
+        self._runs = False
+
     def update(self, wanted: Trajectory, state: BodyState) -> Vec3:
         """The acceleration that follows ``wanted`` from ``state``, ENU [m/s^2]."""
-        if wanted.accelerates_only:
-            self._integral = [0.0, 0.0, 0.0]
-            self._error = [0.0, 0.0, 0.0]
+        if wanted is not self._wanted:
+            self._wanted, self._accelerates = wanted, wanted.accelerates_only
+        if self._accelerates:
+            if self._runs:
+                self._stop()
             self.v_enu, self.a_enu = FREE, wanted.a_enu
             return wanted.a_enu
+        self._runs = True
         get = self._parameters.__getitem__
         self.v_enu = v_enu = self._velocity(wanted, state)
         a = [0.0, 0.0, 0.0]
@@ -85,6 +99,8 @@ class PositionControl:
 
     def integrate(self, dt_s: float) -> None:
         """The error of the last `update` has stood for ``dt_s``; the integral is bounded."""
+        if not self._runs:
+            return
         for i, error in enumerate(self._error):
             if error:
                 gain = float(self._parameters["MPC_XY_VEL_I_ACC" if i < 2 else "MPC_Z_VEL_I_ACC"])

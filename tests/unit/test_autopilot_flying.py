@@ -378,7 +378,7 @@ def test_position_mode_flies_by_the_sticks(rigs: list[Rig]) -> None:
     rig.fly(0.5)
     assert rig.state.omega_flu[2] == pytest.approx(math.radians(75.0), abs=0.1)  # half of MPC_MAN_Y_MAX
     rig.sticks = sticks()
-    rig.fly(3.0)
+    rig.fly(6.0)
     held = rig.state.p_enu
     rig.fly(3.0)
     assert math.dist(rig.state.p_enu, held) < 0.05
