@@ -195,7 +195,7 @@ async def ground_speed_and_climb_are_told(drone: Drone) -> None:
     await drone.offboard_with(drone.offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.8, -0.6, 90.0)))
     steady = lambda m: m.climb_rate_m_s > 0.45 and m.groundspeed_m_s > 0.65  # noqa: E731
     metrics = (await drone.until(drone.telemetry.subscribe_fixedwing_metrics(), steady))[-1]
-    assert 20.0 < metrics.throttle_percentage < 100.0
+    assert 0.2 < metrics.throttle_percentage < 1.0  # MAVSDK 4.1 gives a share here, its documentation says percent
     assert abs(metrics.heading_deg - 90.0) < 15.0
 
 
