@@ -43,7 +43,7 @@ def test_library_example() -> None:
 
 
 def test_a_network_of_your_own_flies_as_the_page_says(tmp_path: Path) -> None:
-    """docs/policies.md: an ONNX file from elsewhere (here the shipped one's) becomes an artefact that evaluates."""
+    """docs/how-to/bring-your-own-policy.md: an ONNX file from elsewhere (here the shipped one's) becomes an artefact that evaluates."""
     shutil.copy(ROOT / "policies" / "artifacts" / "default" / "policy.onnx", tmp_path / "my_policy.onnx")
     code = example("foreign", (ROOT / "docs" / "policies.md").read_text(encoding="utf-8"))
     made = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
