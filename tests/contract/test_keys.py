@@ -68,7 +68,9 @@ def rows(heading: str) -> list[list[str]]:
 
 def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema", "--keys"]) == 0
-    assert capsys.readouterr().out == PAGE.read_text(encoding="utf-8"), "companion schema --keys > docs/reference/keys.md"
+    assert capsys.readouterr().out == PAGE.read_text(encoding="utf-8"), (
+        "companion schema --keys > docs/reference/keys.md"
+    )
 
 
 @pytest.mark.parametrize("lockstep", [False, True])
