@@ -76,6 +76,7 @@ _HEAD = """\
 This page is what `companion schema --metrics` prints; a test compares the two. `GET /metrics` of the daemon's HTTP
 server answers in Prometheus' text format (0.0.4). Every number is read when it is asked for; a scrape takes about a
 millisecond of the loop, so scrape every few seconds, not every tick. Counters begin at 0 with the process.
+A scraper that calls this host by a name needs that name in `http.names`, or it is answered with status 421.
 """
 
 _TAIL = """\

@@ -1,4 +1,4 @@
-"""How the daemon is: the control task's pulse, what systemd is told, and the reading behind metrics and health."""
+"""How the daemon is: the control task's pulse, what systemd is told, and the reading behind the metrics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from companion.instruments import Reading
 from companion.link.inbox import ObstacleInbox
 from companion.link.router import Router
 from companion.metrics import TickMeter
-from companion.prometheus import Exposition
 from companion.publisher import Publisher
 from companion.sdnotify import Notifier
 from companion.session import VehicleSession
@@ -51,7 +50,6 @@ class Vitals:
         self._vehicle_ns = vehicle_ns
         self._publisher: Publisher | None = None
         self._hashed: tuple[Config, str] | None = None
-        self._exposition = Exposition(self.reading)
 
     def up(self, publisher: Publisher) -> None:
         """Every link is open."""
@@ -68,10 +66,6 @@ class Vitals:
 
     def close(self) -> None:
         self._notifier.close()
-
-    def metrics(self) -> bytes:
-        """The body of `/metrics`, of type `prometheus.CONTENT_TYPE`."""
-        return self._exposition.text()
 
     def health(self, *, live_only: bool = False) -> tuple[int, dict[str, Any]]:
         """HTTP status and body of `/healthz`, or of `/livez`."""

@@ -61,8 +61,10 @@ LAYERS = [
         "companion.thinker",
         "companion.publisher",
         "companion.doors",
+        "companion.http",
     },
-    {"companion.vitals"},
+    {"companion.vitals", "companion.page"},
+    {"companion.probes"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]

@@ -17,7 +17,7 @@ from companion.config import parse_config
 from companion.health import problems, report
 from companion.instruments import METRICS
 from companion.link import wire
-from companion.prometheus import LATENCY, metrics_page
+from companion.prometheus import LATENCY, Exposition, metrics_page
 from companion.sdnotify import Notifier
 from companion.service import Service
 from companion.state import Situation, State
@@ -32,9 +32,13 @@ class Daemon:
         self.clock = ManualClock()
         self.service = Service(parse_config({"vehicle": {"name": "uav7"}}), self.clock, notifier=notifier)
         self.vitals = self.service._vitals
+        self._exposition = Exposition(self.vitals.reading)
+
+    def text(self) -> str:
+        return self._exposition.text().decode()
 
     def scrape(self) -> dict[str, Metric]:
-        return {family.name: family for family in text_string_to_metric_families(self.vitals.metrics().decode())}
+        return {family.name: family for family in text_string_to_metric_families(self.text())}
 
     def value(self, name: str, **labels: str) -> float:
         values = [
@@ -59,7 +63,7 @@ def test_every_metric_is_exposed_once_with_help_and_kind(daemon: Daemon) -> None
         assert (family.type, family.documentation) == (metric.kind, metric.meaning)
     assert families[LATENCY].type == "histogram"
     assert "process_resident_memory_bytes" in families
-    names = re.findall(r"^# TYPE (\S+)", daemon.vitals.metrics().decode(), re.MULTILINE)
+    names = re.findall(r"^# TYPE (\S+)", daemon.text(), re.MULTILINE)
     assert len(names) == len(set(names))
 
 
