@@ -23,7 +23,7 @@ LAYERS = [
         "companion.config_traffic",
         "companion.config_types",
     },
-    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload"},
+    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload", "companion.tlog"},
     {
         "companion.tracking",
         "companion.safety",
@@ -34,6 +34,8 @@ LAYERS = [
     },
     {"companion.pilot"},
     {"companion.state"},
+    {"companion.log_files"},
+    {"companion.log_writer"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
     {
         "companion.notices",
@@ -53,6 +55,7 @@ LAYERS = [
         "companion.publisher",
         "companion.doors",
     },
+    {"companion.logbook"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]
