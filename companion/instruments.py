@@ -289,11 +289,11 @@ METRICS = (
         _count("zenoh", "too_large"),
     ),
     Definition(
-        "companion_log_messages",
+        "companion_log_messages_lost",
         "counter",
-        "Messages of the flight log, by what became of them.",
+        "Messages that did not get into the flight log: dropped (its queue was full), lost (after it failed), broken.",
         _group("log"),
-        ("event",),
+        ("reason",),
     ),
     Definition(
         "companion_log_failed", "gauge", "1 once the log could not be written any more.", _one(lambda r: r.log_failed)

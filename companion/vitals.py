@@ -97,6 +97,7 @@ class Vitals:
                 **self._groups(),
                 "router": self._router.counts,
                 "zenoh": {} if publisher is None else publisher.zenoh_counts,
+                "log": {} if publisher is None else publisher.log_counts,
             },
             links=tuple(link.counts for link in self._router.links),
             log_failed=publisher is not None and publisher.log_failure is not None,

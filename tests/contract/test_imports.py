@@ -23,7 +23,7 @@ LAYERS = [
         "companion.config_traffic",
         "companion.config_types",
     },
-    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload"},
+    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload", "companion.tlog"},
     {
         "companion.tracking",
         "companion.safety",
@@ -34,6 +34,8 @@ LAYERS = [
     },
     {"companion.pilot"},
     {"companion.state"},
+    {"companion.log_files"},
+    {"companion.log_writer"},
     {
         "companion.link",
         "companion.metrics",
@@ -65,6 +67,7 @@ LAYERS = [
     },
     {"companion.vitals", "companion.page"},
     {"companion.probes"},
+    {"companion.logbook"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]
