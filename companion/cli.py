@@ -29,6 +29,8 @@ examples:
   companion doctor -c configs/default.toml    is everything fit to fly, and what if the daemon dies?
   companion publish --orbit "center=1,2,1.5 radius=2 speed=1.5" --connect tcp/127.0.0.1:7447
                                               publish a made-up obstacle
+  companion monitor --connect tcp/127.0.0.1:7447
+                                              every vehicle on the network, in this terminal
 """
 
 
@@ -47,9 +49,11 @@ def build_parser() -> argparse.ArgumentParser:
     from companion.bench import command as bench
     from companion.demo import command as demo
     from companion.doctor import command as doctor
+    from companion.monitor import command as monitor
 
     demo.add_parser(commands)
     publish.add_parser(commands)
+    monitor.add_parser(commands)
     doctor.add_parser(commands)
     bench.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")

@@ -115,6 +115,7 @@ class Publisher:
         target_enu: Vec3 | None,
         counts: Callable[[], Mapping[str, int]],
         meter: TickMeter,
+        sources: Callable[[], dict[str, wire.SourceOut]] = dict,
     ) -> None:
         """The status, at 5 Hz and whenever the situation or the target changed."""
         situation = session.situation
@@ -142,6 +143,7 @@ class Publisher:
             verdict=self._verdict,
             counts=dict(counts()),
             tick_ms=meter.quantiles_ms(last=1000),
+            sources=sources(),
         )
         self._zenoh.put("companion/status", status)
         if self._recorder is not None:

@@ -33,7 +33,7 @@ from companion.parameters import with_stored
 from companion.pilot import Pilot, PilotOutput
 from companion.publisher import Publisher
 from companion.record import Recorder
-from companion.report import setpoint_record
+from companion.report import setpoint_record, sources_out
 from companion.route import Route
 from companion.sdnotify import Notifier
 from companion.session import VehicleSession
@@ -291,6 +291,7 @@ class Service:
             target_enu=self._route.current,
             counts=self._counts,
             meter=self._meter,
+            sources=lambda: sources_out(self._inbox, self._vehicle_ns),
         )
 
     def _groups(self) -> dict[str, dict[str, int]]:

@@ -92,7 +92,7 @@ class Vitals:
             agile=0 if publisher is None else len(publisher.agile),
             warnings=len(session.watch.notices.standing),
             accepted=self._inbox.accepted,
-            source_age_s=self._inbox.ages_s(self._vehicle_ns()),
+            source_age_s={n: s for n, s in self._inbox.ages_s(self._vehicle_ns()).items() if s is not None},
             groups={
                 **self._groups(),
                 "router": self._router.counts,

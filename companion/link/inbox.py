@@ -148,10 +148,10 @@ class ObstacleInbox:
         entry = self._sources.get(source)
         return None if entry is None else entry.newest_stamp_ns
 
-    def ages_s(self, now_ns: int) -> dict[str, float]:
-        """Vehicle time since the stamp of each source's newest frame [s], for those that have sent one."""
-        newest = {name: entry.newest_stamp_ns for name, entry in self._sources.items()}
-        return {name: (now_ns - stamp_ns) / NS_PER_S for name, stamp_ns in newest.items() if stamp_ns is not None}
+    def ages_s(self, now_ns: int) -> dict[str, float | None]:
+        """Vehicle time since the stamp of the newest accepted frame of each source, configured or heard [s]."""
+        newest = {n: e.newest_stamp_ns for n, e in self._sources.items() if e.arrived or n in self._configured}
+        return {n: None if stamp_ns is None else (now_ns - stamp_ns) / NS_PER_S for n, stamp_ns in newest.items()}
 
     @property
     def sources(self) -> tuple[str, ...]:

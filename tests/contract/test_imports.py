@@ -68,7 +68,14 @@ LAYERS = [
     {"companion.vitals", "companion.page"},
     {"companion.probes"},
     {"companion.logbook"},
-    {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
+    {
+        "companion.service",
+        "companion.publish",
+        "companion.monitor",
+        "companion.demo",
+        "companion.bench",
+        "companion.doctor",
+    },
     {"companion.cli"},
 ]
 BRAIN = (

@@ -206,6 +206,7 @@ def test_the_watchdog_is_fed_by_the_pulse(tmp_path: Path) -> None:
 
 def test_a_scrape_reads_and_changes_nothing() -> None:
     daemon = Daemon()
-    before = daemon.service._counts()
+    daemon.service._meter.tick(1.0, 1.0, "nominal")
+    before = daemon.vitals.reading()
     daemon.scrape()
-    assert daemon.service._counts() == before
+    assert daemon.vitals.reading() == before
