@@ -22,7 +22,6 @@ from companion.types import NS_PER_S, DetectionFrame, TrackTable, Vec3, VehicleS
 log = logging.getLogger("companion")
 
 STATUS_NS = NS_PER_S // 5
-FLUSH_NS = NS_PER_S
 
 
 class Publisher:
@@ -33,14 +32,28 @@ class Publisher:
         self._recorder = recorder
         self._hash = FlightHash()
         self._verdict = "silent"
-        self._tracks = 0
-        self._agile: list[str] = []
-        self._flushed_ns = 0
+        self.tracks = 0  # of the last tick
+        self.agile: list[str] = []
         self._last: tuple[int, object] | None = None
+
+    @property
+    def log_counts(self) -> Mapping[str, int]:
+        """Messages that did not get into the log; empty without one."""
+        return {} if self._recorder is None else self._recorder.counts
 
     @property
     def log_hash(self) -> str:
         return self._hash.hexdigest()
+
+    @property
+    def log_failure(self) -> str | None:
+        """Why the log is not written any more, or None."""
+        return None if self._recorder is None else self._recorder.failure
+
+    @property
+    def zenoh_counts(self) -> Mapping[str, int]:
+        """What came by Zenoh."""
+        return self._zenoh.counts
 
     def tick(
         self,
@@ -50,18 +63,22 @@ class Publisher:
         frames: tuple[DetectionFrame, ...],
         output: PilotOutput | None,
         tracks: Callable[[], TrackTable],
+        arrived_unix_ns: int | None = None,
     ) -> None:
-        """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left."""
+        """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left.
+
+        ``arrived_unix_ns``: when the vehicle state came.
+        """
         self._verdict = record.verdict
         payload = wire.encode(record)
         self._zenoh.put_encoded("companion/setpoint", payload)
         table = tracks()
-        self._tracks = len(table)
-        self._agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
+        self.tracks = len(table)
+        self.agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
         if self._recorder is not None:
             self._recorder.frames(frames, vehicle.stamp_ns)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
-        self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle))
+        self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle, arrived_unix_ns))
         if output is not None:
             self._offer("companion/tracks", vehicle.stamp_ns, lambda: tracks_out(output, table))
         self._hash.tick(state, vehicle, frames, output, table)
@@ -69,27 +86,25 @@ class Publisher:
     def _offer(self, key: str, stamp_ns: int, build: Callable[[], msgspec.Struct]) -> None:
         """Build and encode once for whoever wants it: subscribers, the log, or nobody."""
         wanted = self._zenoh.wanted(key)
-        if not wanted and self._recorder is None:
-            return
-        payload = wire.encode(build())
         if wanted:
+            payload = wire.encode(build())
             self._zenoh.put_encoded(key, payload)
-        if self._recorder is not None:
-            self._recorder.message(f"/{key}", stamp_ns, payload)
+            if self._recorder is not None:
+                self._recorder.message(f"/{key}", stamp_ns, payload)
+        elif self._recorder is not None:
+            self._recorder.later(f"/{key}", stamp_ns, build)
 
     def configured(self, config: Config, stamp_ns: int) -> None:
         """The profile is settled, or live parameters changed: the log says what holds from here on."""
         if self._recorder is not None:
             self._recorder.config(config, stamp_ns)
 
-    def keep_log(self, now_ns: int) -> str | None:
-        """Flush the log once a second; why it is not written any more, or None."""
+    def keep_log(self) -> str | None:
+        """The tick is over: let the log be written. What has befallen it since the last call, or None."""
         if self._recorder is None:
             return None
-        if now_ns - self._flushed_ns >= FLUSH_NS:
-            self._flushed_ns = now_ns
-            self._recorder.flush()
-        return self._recorder.failure
+        self._recorder.kick()
+        return self._recorder.trouble()
 
     def status(
         self,
@@ -100,6 +115,7 @@ class Publisher:
         target_enu: Vec3 | None,
         counts: Callable[[], Mapping[str, int]],
         meter: TickMeter,
+        sources: Callable[[], dict[str, wire.SourceOut]] = dict,
     ) -> None:
         """The status, at 5 Hz and whenever the situation or the target changed."""
         situation = session.situation
@@ -110,7 +126,8 @@ class Publisher:
             return
         self._last = (now_ns, key)
         if changed:
-            log.info("%s (%s)", situation.state, situation.reason)
+            told = {"state": situation.state.value, "reason": situation.reason, "t_ns": vehicle_ns}
+            log.info("%s (%s)", situation.state, situation.reason, extra=told)
         status = wire.Status(
             state=situation.state.value,
             reason=situation.reason,
@@ -121,11 +138,12 @@ class Publisher:
             profile=session.config.vehicle.profile,
             warnings=list(session.watch.notices.standing),
             target=target,
-            tracks=self._tracks,
-            agile=self._agile,
+            tracks=self.tracks,
+            agile=self.agile,
             verdict=self._verdict,
             counts=dict(counts()),
             tick_ms=meter.quantiles_ms(last=1000),
+            sources=sources(),
         )
         self._zenoh.put("companion/status", status)
         if self._recorder is not None:

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from companion.link.wire import MarginOut, RowOut, SetpointRecord, TrackOut, TracksOut, Vec, VehicleOut
+from companion.link.inbox import ObstacleInbox
+from companion.link.wire import MarginOut, RowOut, SetpointRecord, SourceOut, TrackOut, TracksOut, Vec, VehicleOut
 from companion.pilot import PilotOutput
 from companion.state import State
 from companion.types import DetectionFrame, RowRecord, TrackTable, Vec3, VehicleState, Verdict
@@ -41,10 +42,11 @@ def setpoint_record(
         disturbance=(0.0, 0.0, 0.0) if output is None else _vec(output.disturbance),
         tracks=0 if output is None else len(output.prediction),
         timings_ms=dict(timings_ms),
+        detour=result is not None and result.detour,
     )
 
 
-def vehicle_out(vehicle: VehicleState) -> VehicleOut:
+def vehicle_out(vehicle: VehicleState, arrived_unix_ns: int | None = None) -> VehicleOut:
     w, x, y, z = vehicle.q_enu_from_flu.tolist()
     return VehicleOut(
         stamp_ns=vehicle.stamp_ns,
@@ -52,6 +54,7 @@ def vehicle_out(vehicle: VehicleState) -> VehicleOut:
         velocity=_vec(vehicle.v_enu),
         attitude=(w, x, y, z),
         reset_counter=vehicle.reset_counter,
+        arrived_unix_ns=arrived_unix_ns,
     )
 
 
@@ -93,6 +96,12 @@ def tracks_out(output: PilotOutput, table: TrackTable) -> TracksOut:
             for name, p, v, a, radius, covariance, mu, status, sources, surprise, growth in rows
         ],
     )
+
+
+def sources_out(inbox: ObstacleInbox, vehicle_ns: int) -> dict[str, SourceOut]:
+    """Every obstacle source with its age at ``vehicle_ns``."""
+    ages_s, frames = inbox.ages_s(vehicle_ns), inbox.accepted
+    return {name: SourceOut(age_s=age_s, frames=frames[name]) for name, age_s in sorted(ages_s.items())}
 
 
 class FlightHash:

@@ -33,13 +33,15 @@ from companion.parameters import with_stored
 from companion.pilot import Pilot, PilotOutput
 from companion.publisher import Publisher
 from companion.record import Recorder
-from companion.report import setpoint_record
+from companion.report import setpoint_record, sources_out
 from companion.route import Route
+from companion.sdnotify import Notifier
 from companion.session import VehicleSession
 from companion.state import FLYING
 from companion.thinker import Thinker
 from companion.timebase import TimeBase
 from companion.types import NS_PER_S, VehicleState
+from companion.vitals import Vitals
 
 log = logging.getLogger("companion")
 
@@ -51,7 +53,9 @@ RELEASE_NS = 6 * NS_PER_S // 10  # on shutdown in flight the autopilot is given 
 class Service:
     """One vehicle, one brain. ``run`` returns after ``stop``, and raises whatever else ended it."""
 
-    def __init__(self, config: Config, clock: Clock, *, pilot: Pilot | None = None) -> None:
+    def __init__(
+        self, config: Config, clock: Clock, *, pilot: Pilot | None = None, notifier: Notifier | None = None
+    ) -> None:
         base, config = config, with_stored(config)
         self._config = config
         self._clock = clock
@@ -68,6 +72,7 @@ class Service:
             sources=(*config.lockstep_sources, *config.obstacles.required),
             on_report=log.warning,
             doors=config.traffic.open_doors,
+            unix_ns=clock.unix_ns,
         )
         self._traffic = TrafficDoors(
             config.traffic,
@@ -95,12 +100,14 @@ class Service:
         self._services = Microservices(
             base, config, self._codec, self._session, clock, send=self._transport.send, retune=self._retune
         )
+        parts = self._session, self._meter, self._inbox, self._transport
+        self._vitals = Vitals(clock, notifier or Notifier(None), *parts, self._groups, lambda: self._vehicle_ns)
         self._wake = asyncio.Event()
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
         self._arrived_ns = 0  # its arrival, for the latency figure
+        self._arrived_unix_ns = 0  # and for the log
         self._vehicle_ns = 0  # vehicle time of the newest state
-        self._log_failed = False
         self._last_beat: tuple[int, int] | None = None
 
     def stop(self) -> None:
@@ -118,6 +125,7 @@ class Service:
         config = self._config
         loop = asyncio.get_running_loop()
         async with contextlib.AsyncExitStack() as stack:
+            stack.callback(self._vitals.close)
             recorder = None
             if config.log.directory is not None:
                 recorder = Recorder(Path(config.log.directory) / "flight.mcap", config)
@@ -127,11 +135,24 @@ class Service:
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
             self._publisher = Publisher(zenoh, recorder)
+            if config.http.enabled:
+                await self._serve_http(stack)
             gc.collect()
             gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
+            self._vitals.up(self._publisher)
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
+
+    async def _serve_http(self, stack: contextlib.AsyncExitStack) -> None:
+        """Whatever is read by HTTP; aiohttp is imported only where it serves."""
+        from companion.http import HttpServer
+        from companion.probes import add_probes
+
+        server = HttpServer(self._config.http)
+        add_probes(server, self._vitals)
+        await server.start()
+        stack.push_async_callback(server.stop)
 
     async def _until_stopped(self) -> None:
         try:
@@ -175,6 +196,7 @@ class Service:
                 self._thinker.observe_ahead(self._vehicle_ns, self._now_ns())
                 self._barrier.check_simulator(self._vehicle_ns)
             self._housekeeping()
+            self._vitals.beat()
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
             ):
@@ -183,6 +205,7 @@ class Service:
     def _begin_shutdown(self) -> int:
         """Hand the vehicle back: ask for the hold mode and stream until it is seen, for at most RELEASE_NS."""
         log.info("stopping")
+        self._vitals.stopping()
         if self._session.situation.state in FLYING:
             self._session.release(self._now_ns())
             self._flush()
@@ -213,7 +236,8 @@ class Service:
         }
         state = session.situation.state
         record = setpoint_record(vehicle.stamp_ns, state, output, sent=sent, messages=messages, timings_ms=timings_ms)
-        self._publisher.tick(record, state, vehicle, taken.frames, output, self._thinker.tracks)
+        arrived_ns, tracks = self._arrived_unix_ns, self._thinker.tracks
+        self._publisher.tick(record, state, vehicle, taken.frames, output, tracks, arrived_unix_ns=arrived_ns)
         self._services.note(vehicle, output)
         busy_ms = (stopwatch_ns() - started_ns) / 1e6
         self._meter.tick(timings_ms["total"], busy_ms, record.verdict)
@@ -243,15 +267,14 @@ class Service:
         self._services.poll()
         self._flush()
         self._publish_status(now_ns)
-        self._keep_log(now_ns)
+        self._keep_log()
 
-    def _keep_log(self, now_ns: int) -> None:
-        """Flush the log now and then; a log that cannot be written is told once and flown without."""
-        failure = self._publisher.keep_log(now_ns)
-        if failure is not None and not self._log_failed:
-            self._log_failed = True
-            log.error("%s", failure)
-            self._session.say(mav.SEVERITY_WARNING, "companion: log lost, flying on")
+    def _keep_log(self) -> None:
+        """Let the log be written; what goes wrong with it is told once and flown on without."""
+        trouble = self._publisher.keep_log()
+        if trouble is not None:
+            log.error("%s", trouble)
+            self._session.say(mav.SEVERITY_WARNING, "companion: log damaged, flying on")
 
     def _flush(self) -> int:
         """Send what the session has to say; the number of MAVLink packets."""
@@ -268,13 +291,17 @@ class Service:
             target_enu=self._route.current,
             counts=self._counts,
             meter=self._meter,
+            sources=lambda: sources_out(self._inbox, self._vehicle_ns),
         )
+
+    def _groups(self) -> dict[str, dict[str, int]]:
+        groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
+        groups |= {"mavlink": self._codec.counts, "texts": self._session.text_counts}
+        return groups | {"autopilot": self._session.watch.counts, "timesync": self._time.counts}
 
     def _counts(self) -> dict[str, int]:
         """Everything counted, by kind."""
-        groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
-        groups |= {"mavlink": self._codec.counts, "texts": self._session.text_counts}
-        groups |= {"autopilot": self._session.watch.counts, "timesync": self._time.counts}
+        groups = self._groups() | {"log": dict(self._publisher.log_counts)}
         return self._meter.counts(groups) | self._transport.all_counts()
 
     def _summary(self, recorder: Recorder | None) -> Summary:
@@ -309,7 +336,7 @@ class Service:
             return  # reordered or repeated by the link
         self._pending = vehicle
         self._vehicle_ns = vehicle.stamp_ns
-        self._arrived_ns = stopwatch_ns()
+        self._arrived_ns, self._arrived_unix_ns = stopwatch_ns(), self._clock.unix_ns()
         self._barrier.pending()
         self._traffic.on_vehicle(vehicle)
         self._session.heard_vehicle(self._now_ns())

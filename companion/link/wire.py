@@ -124,6 +124,7 @@ class SetpointRecord(Struct, frozen=True, kw_only=True):
     disturbance: Vec
     tracks: int
     timings_ms: dict[str, float]
+    detour: bool = False  # the answer to a reference along the obstacle's boundary, not to u_ref
 
 
 class VehicleOut(Struct, frozen=True, kw_only=True):
@@ -134,6 +135,7 @@ class VehicleOut(Struct, frozen=True, kw_only=True):
     velocity: Vec
     attitude: tuple[float, float, float, float]
     reset_counter: int | None = None  # of the estimator, where the autopilot tells
+    arrived_unix_ns: int | None = None  # at the daemon, on its computer's clock
 
 
 class TrackOut(Struct, frozen=True, kw_only=True):
@@ -160,6 +162,13 @@ class TracksOut(Struct, frozen=True, kw_only=True):
     tracks: list[TrackOut]
 
 
+class SourceOut(Struct, frozen=True, kw_only=True):
+    """An obstacle source, configured or heard."""
+
+    age_s: float | None  # vehicle time since the stamp of its newest accepted frame; None: none was
+    frames: int  # accepted since the daemon started
+
+
 class Status(Struct, frozen=True, kw_only=True):
     """`{prefix}/companion/status`, 5 Hz and on change."""
 
@@ -177,6 +186,7 @@ class Status(Struct, frozen=True, kw_only=True):
     verdict: str
     counts: dict[str, int]  # ticks by verdict, frames by reason of rejection
     tick_ms: dict[str, float]  # p50, p99, max of the last 1000 ticks
+    sources: dict[str, SourceOut] = {}
 
 
 T = TypeVar("T", bound=Struct)
