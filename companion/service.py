@@ -127,11 +127,21 @@ class Service:
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
             self._publisher = Publisher(zenoh, recorder)
+            if config.http.enabled:
+                await self._serve_http(stack)
             gc.collect()
             gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
+
+    async def _serve_http(self, stack: contextlib.AsyncExitStack) -> None:
+        """Whatever is read by HTTP; aiohttp is imported only where it serves."""
+        from companion.http import HttpServer
+
+        server = HttpServer(self._config.http)
+        await server.start()
+        stack.push_async_callback(server.stop)
 
     async def _until_stopped(self) -> None:
         try:

@@ -52,7 +52,9 @@ LAYERS = [
         "companion.thinker",
         "companion.publisher",
         "companion.doors",
+        "companion.http",
     },
+    {"companion.page"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]
