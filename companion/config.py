@@ -159,6 +159,8 @@ class ParamsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 class LogConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     directory: str | None = None  # None: no log
+    format: Literal["text", "json"] = "text"  # of what is said on standard error
+    level: Literal["debug", "info", "warning", "error", "critical"] = "info"  # the least that is said there
 
 
 class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

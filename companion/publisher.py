@@ -33,14 +33,24 @@ class Publisher:
         self._recorder = recorder
         self._hash = FlightHash()
         self._verdict = "silent"
-        self._tracks = 0
-        self._agile: list[str] = []
+        self.tracks = 0  # of the last tick
+        self.agile: list[str] = []
         self._flushed_ns = 0
         self._last: tuple[int, object] | None = None
 
     @property
     def log_hash(self) -> str:
         return self._hash.hexdigest()
+
+    @property
+    def log_failure(self) -> str | None:
+        """Why the log is not written any more, or None."""
+        return None if self._recorder is None else self._recorder.failure
+
+    @property
+    def zenoh_counts(self) -> Mapping[str, int]:
+        """What came by Zenoh."""
+        return self._zenoh.counts
 
     def tick(
         self,
@@ -56,8 +66,8 @@ class Publisher:
         payload = wire.encode(record)
         self._zenoh.put_encoded("companion/setpoint", payload)
         table = tracks()
-        self._tracks = len(table)
-        self._agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
+        self.tracks = len(table)
+        self.agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
         if self._recorder is not None:
             self._recorder.frames(frames, vehicle.stamp_ns)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
@@ -110,7 +120,8 @@ class Publisher:
             return
         self._last = (now_ns, key)
         if changed:
-            log.info("%s (%s)", situation.state, situation.reason)
+            told = {"state": situation.state.value, "reason": situation.reason, "t_ns": vehicle_ns}
+            log.info("%s (%s)", situation.state, situation.reason, extra=told)
         status = wire.Status(
             state=situation.state.value,
             reason=situation.reason,
@@ -121,8 +132,8 @@ class Publisher:
             profile=session.config.vehicle.profile,
             warnings=list(session.watch.notices.standing),
             target=target,
-            tracks=self._tracks,
-            agile=self._agile,
+            tracks=self.tracks,
+            agile=self.agile,
             verdict=self._verdict,
             counts=dict(counts()),
             tick_ms=meter.quantiles_ms(last=1000),

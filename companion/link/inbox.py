@@ -44,7 +44,8 @@ class ObstacleInbox:
         on_report: told about rejected frames in one line, at most once a second of vehicle time.
         doors: sources of the daemon's own (`push_decoded`); what is published under their names is rejected.
 
-    ``counts`` has frames (accepted), dropped (queue full), thinned and every reason of rejection.
+    ``counts`` has frames (accepted), dropped (queue full), thinned and every reason of rejection; ``accepted`` the
+    frames of each source (of at most 64, the rest together as "").
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class ObstacleInbox:
         doors: Iterable[str] = (),
     ) -> None:
         self.counts: Counter[str] = Counter()
+        self.accepted: Counter[str] = Counter()
         self._queue = queue
         self._per_tick = per_tick
         self._max_age_s = max_age_s
@@ -142,6 +144,11 @@ class ObstacleInbox:
         entry = self._sources.get(source)
         return None if entry is None else entry.newest_stamp_ns
 
+    def ages_s(self, now_ns: int) -> dict[str, float]:
+        """Vehicle time since the stamp of each source's newest frame [s], for those that have sent one."""
+        newest = {name: entry.newest_stamp_ns for name, entry in self._sources.items()}
+        return {name: (now_ns - stamp_ns) / NS_PER_S for name, stamp_ns in newest.items() if stamp_ns is not None}
+
     @property
     def sources(self) -> tuple[str, ...]:
         """Every source that has sent a frame, sorted."""
@@ -168,6 +175,7 @@ class ObstacleInbox:
                     self.reject(name, error)
                     continue
                 self.counts["frames"] += 1
+                self.accepted[name if name in self.accepted or len(self.accepted) < MAX_SOURCES else ""] += 1
                 entry.newest_stamp_ns = max(frame.stamp_ns, entry.newest_stamp_ns or frame.stamp_ns)
                 frames.append(frame)
         self._report(now_ns)

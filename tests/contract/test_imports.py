@@ -34,7 +34,16 @@ LAYERS = [
     },
     {"companion.pilot"},
     {"companion.state"},
-    {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
+    {
+        "companion.link",
+        "companion.metrics",
+        "companion.route",
+        "companion.report",
+        "companion.record",
+        "companion.sdnotify",
+        "companion.logging_setup",
+    },
+    {"companion.prometheus", "companion.health", "companion.instruments"},
     {
         "companion.notices",
         "companion.confirm",
@@ -54,7 +63,8 @@ LAYERS = [
         "companion.doors",
         "companion.http",
     },
-    {"companion.page"},
+    {"companion.vitals", "companion.page"},
+    {"companion.probes"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]
