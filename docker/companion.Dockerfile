@@ -9,7 +9,11 @@ ARG EXTRAS=""
 RUN --mount=type=secret,id=pip.conf,target=/etc/pip.conf \
     python -m venv --without-pip /opt/companion \
     && python requirements.py ${EXTRAS} > requirements.txt \
-    && python -m pip --python /opt/companion/bin/python install -c constraints.txt -r requirements.txt
+    && python -m pip --python /opt/companion/bin/python install -c constraints.txt -r requirements.txt \
+    # a quarter of it is never read: tests of the libraries, and the MAVLink dialects that the daemon does not speak
+    && find /opt/companion/lib -type d -name tests -prune -exec rm -r {} + \
+    && find /opt/companion/lib -path '*/pymavlink/dialects/*' -type f \
+        ! -name '__init__*' ! -path '*/v20/*ardupilotmega*' -delete
 COPY LICENSE README.md ./
 COPY configs configs/
 COPY policies policies/

@@ -65,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
         help="vehicle time over wall time, 0.01 to 100 (default 1); what the machine cannot keep is late_s",
     )
     run.add_argument("--stay", action="store_true", help="fly on after the end of the flight, until a signal")
+    run.add_argument("--must-reach", action="store_true", help="exit status 1 if the target has not been reached")
     run.add_argument("--onboard-port", type=_port, default=14540, help="UDP port of the companion (default 14540)")
     run.add_argument("--gcs-port", type=_port, default=14550, help="UDP port of the ground station (default 14550)")
     for link, example in (("onboard", 14580), ("gcs", 18570)):
@@ -202,7 +203,8 @@ def _run(arguments: argparse.Namespace) -> int:
         with _stopped_by_signals(runner.stop):
             summary = runner.run()
     _report(summary, as_json=arguments.json)
-    return FAILED if summary["collided"] or summary["ended"] == "timeout" else DONE
+    missed = arguments.must_reach and not summary["reached"]
+    return FAILED if summary["collided"] or summary["ended"] == "timeout" or missed else DONE
 
 
 def _check(arguments: argparse.Namespace) -> int:
