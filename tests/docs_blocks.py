@@ -6,7 +6,7 @@ a block says what is not plain:
     <!-- file: NAME -->          the block is the content of a file of that name
     <!-- until: TEXT -->         the last command goes on beside the others, to the end; TEXT says that it is up
     <!-- beside: REASON -->      the same for a command that says nothing when it is up
-    <!-- exit: N -->             the last command ends with this status instead of 0
+    <!-- exit: N or M -->        the last command ends with such a status instead of 0
     <!-- slow: REASON -->        run only among the slow tests
     <!-- not run: REASON -->     needs what a test has not: hardware, firmware, root, a container engine
 

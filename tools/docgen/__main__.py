@@ -9,6 +9,7 @@ from pathlib import Path
 
 from companion import tunables
 from companion.link.keys import key_page
+from companion.prometheus import metrics_page
 from tools.docgen import commands, configuration, mavlink, pages, scenarios, states
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -27,7 +28,7 @@ MAKERS: dict[str, pages.Maker] = {
     "scenario-list": scenarios.shipped,
     **{f"commands-{name}": partial(commands.page, name) for name in commands.PARSERS},
 }
-WHOLE: dict[str, pages.Maker] = {"reference/keys.md": key_page}
+WHOLE: dict[str, pages.Maker] = {"reference/keys.md": key_page, "reference/metrics.md": metrics_page}
 
 
 def main(argv: list[str] | None = None) -> int:
