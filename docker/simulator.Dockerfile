@@ -33,7 +33,6 @@ COPY docker/health.py /opt/companion/health.py
 ENV PATH=/opt/companion/bin:$PATH HOME=/tmp PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
 WORKDIR /var/lib/companion
 USER 10001:10001
-VOLUME ["/var/lib/companion"]
 STOPSIGNAL SIGTERM
 # the simulator sends to this port of the loopback whether somebody listens or not
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 \
