@@ -14,6 +14,7 @@ import asyncio
 import contextlib
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -149,6 +150,7 @@ async def _draw(listener: Listener, clock: Clock, where: str) -> None:
     from companion.monitor.view import screen
 
     console, choice = Console(), Choice()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, choice.press, "q")  # the terminal is given back
     with Live(console=console, screen=True, auto_refresh=False) as live, _keys(choice.press):
         while not choice.ended:
             sights = listener.look()

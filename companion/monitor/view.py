@@ -22,7 +22,8 @@ _STATES = {
 }
 _VERDICTS = {"nominal": "green", "adjusted": "yellow", "relaxed": "bold red", "braking": "bold yellow"}
 _FACTS_WIDTH = 58  # columns of the words beside the picture
-_LIST_AND_FRAME = 6  # lines around the list of vehicles and the panel
+_FACTS_ROWS = 16  # lines of those words, as a rule
+_FRAME = 3  # lines: the panel's edges, and one that a terminal scrolls by
 MIN_PLAN_ROWS, MAX_PLAN_ROWS = 8, 28
 
 
@@ -31,8 +32,9 @@ def screen(sights: Sequence[Sight], chosen: int, *, columns: int, rows: int, end
     if not sights:
         return Panel(Text(f"no vehicle heard yet ({endpoint})"), title="companion monitor", subtitle="q quit")
     sight = sights[min(chosen, len(sights) - 1)]
-    body: list[RenderableType] = [fleet_table(sights, chosen)] if len(sights) > 1 else []
-    plan_rows = min(MAX_PLAN_ROWS, rows - _LIST_AND_FRAME - (len(sights) + 2 if body else 0))
+    listed = min(len(sights), max(3, rows - _FACTS_ROWS - _FRAME))
+    body: list[RenderableType] = [fleet_table(sights, chosen, listed)] if len(sights) > 1 else []
+    plan_rows = min(MAX_PLAN_ROWS, rows - _FRAME - (listed + 1 if body else 0))
     keys = "↑ ↓ choose, q quit" if len(sights) > 1 else "q quit"
     parts: list[RenderableType] = [facts(sight)]
     plan_columns = columns - _FACTS_WIDTH - 8
@@ -43,17 +45,18 @@ def screen(sights: Sequence[Sight], chosen: int, *, columns: int, rows: int, end
     return Group(*body)
 
 
-def fleet_table(sights: Sequence[Sight], chosen: int) -> Table:
-    """A line for each vehicle."""
+def fleet_table(sights: Sequence[Sight], chosen: int, most: int) -> Table:
+    """A line for each vehicle, of many those around the chosen one."""
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    first = max(0, min(chosen - most // 2, len(sights) - most))
     for head in ("", "vehicle", "state", "verdict", "clearance", "target", "speed", "tracks", "tick"):
         table.add_column(head, no_wrap=True)
-    for index, sight in enumerate(sights):
+    for index, sight in enumerate(sights[first : first + most], start=first):
         e = essentials(sight)
         table.add_row(
             "▶" if index == chosen else "",
             Text(shown(e.name)),
-            _state(e),
+            _state(e, short=True),
             _verdict(e),
             "-" if e.nearest is None else f"{e.nearest.clearance_m:.2f} m",
             _number(e.target_m, "m"),
@@ -72,18 +75,20 @@ def facts(sight: Sight) -> Table:
     table.add_column(overflow="fold")
     for name, value in (
         ("state", _state(e)),
-        ("reason", Text(shown(e.reason or "-"))),
-        ("mode", Text(_mode(e))),
+        ("reason" if e.presence == "alive" else "last reason", Text(shown(e.reason or "-"))),
+        ("mode" if e.presence == "alive" else "last mode", Text(_mode(e))),
         ("verdict", _verdict(e)),
         ("nearest", _nearest(e)),
         ("target", "-" if e.target_m is None else f"{e.target_m:.1f} m away"),
         ("speed", _number(e.speed_m_s, "m/s")),
-        ("position", "-" if e.position is None else "  ".join(f"{x:.2f}" for x in e.position) + " m"),
+        ("position", "-" if e.position is None else "  ".join(f"{x:z.2f}" for x in e.position) + " m"),
         ("worst row", _worst(e)),
         ("latency", Text(_latency(e))),
         ("tracks", str(e.tracks)),
     ):
         table.add_row(name, value)
+    if e.presence != "alive":
+        return table  # its sources and warnings are no news any more
     for name, source in e.sources.items():
         table.add_row("source", _source(name, source.age_s, source.frames))
     if e.rejected:
@@ -102,7 +107,7 @@ def line(e: Essentials) -> str:
     near = "no track"
     if e.nearest is not None:
         near = f"clearance {e.nearest.clearance_m:.2f} m to {shown(e.nearest.id)}"
-        near += f" closing {e.nearest.closing_m_s:.2f} m/s"
+        near += f" closing {e.nearest.closing_m_s:z.2f} m/s"
     words = [f"{shown(e.name)} {e.state} ({shown(e.reason or '')})", _mode(e), e.verdict or "no tick", near]
     words.append("no target" if e.target_m is None else f"target {e.target_m:.1f} m")
     words += [f"speed {_number(e.speed_m_s, 'm/s')}", f"tick {_number(e.latency_ms, 'ms')}"]
@@ -120,8 +125,10 @@ def shown(text: str) -> str:
     return "".join(character if character.isprintable() else "?" for character in text)
 
 
-def _state(e: Essentials) -> Text:
+def _state(e: Essentials, *, short: bool = False) -> Text:
     since = "" if e.silent_s is None else f" for {e.silent_s:.1f} s"
+    if short and e.presence != "alive":
+        return Text(f"{e.presence.upper()}{since}", "bold red")
     if e.presence == "gone":
         return Text(f"GONE: its presence token was dropped, nothing heard{since}", "bold red")
     if e.presence == "silent":
@@ -155,7 +162,7 @@ def _nearest(e: Essentials) -> Text:
 def _worst(e: Essentials) -> Text:
     if e.worst is None:
         return Text("-")
-    return Text(f"{shown(e.worst)}, epsilon {e.epsilon:.3f}, slack {e.slack_m_s2:.2f} m/s²")
+    return Text(f"{shown(e.worst)}, epsilon {e.epsilon:.3f}, slack {e.slack_m_s2:z.2f} m/s²")
 
 
 def _latency(e: Essentials) -> str:

@@ -33,12 +33,12 @@ import asyncio, os, signal, sys
 from companion.cli import main
 from companion.service import Service
 
-turn = Service._keep_log
-def housekeeping(self, now_ns):
-    turn(self, now_ns)
+turn = Service._housekeeping
+def housekeeping(self):
+    turn(self)
     if os.path.exists(sys.argv[1]):
         signal.pause()
-Service._keep_log = housekeeping
+Service._housekeeping = housekeeping
 sys.exit(main(sys.argv[2:]))
 """
 
