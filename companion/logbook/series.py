@@ -33,7 +33,10 @@ class Stretch:
 
 @dataclass(slots=True)
 class Series:
-    """Everything of a flight by tick; ``t_s`` counts from the first, and goes on where the vehicle's clock restarts."""
+    """Everything of a flight by tick; ``t_s`` counts from the first, and goes on where the vehicle's clock restarts.
+
+    ``records`` are without their rows but the worst.
+    """
 
     records: list[SetpointRecord] = field(default_factory=list)
     t_s: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -134,7 +137,7 @@ class _Loader:
     def _on_setpoint(self, message: LogMessage) -> None:
         record = decode(self._log, message, SetpointRecord)
         self._t_s.append(self._time.tick(record.stamp_ns))
-        self._series.records.append(record)
+        self._series.records.append(msgspec.structs.replace(record, rows=[]))  # an hour of rows is a lot of memory
 
     def _on_vehicle(self, message: LogMessage) -> None:
         vehicle = decode(self._log, message, VehicleOut)
