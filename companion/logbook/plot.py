@@ -42,7 +42,8 @@ def plot(log: FlightLog, series: Series, path: Path) -> None:
     if not series.records or not len(series.p_enu):
         raise ConfigError(f"{log.path}: no tick, nothing to plot")
     figure = Figure(figsize=(11.0, 15.5), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=(0.33, 0.67))
+    halves: Any = figure.subfigures(2, 1, height_ratios=(0.3, 0.7))
+    top, bottom = halves
     shown = _shown(series)
     _draw_views(top, series, shown)
     axes = bottom.subplots(
@@ -162,7 +163,7 @@ def _draw_clearance(axes: Any, series: Series, shown: list[tuple[Stretch, str, s
     if closest is not None:
         axes.plot(closest[2], closest[0], "o", color=INK, markersize=4, label=f"least: {closest[0]:.2f} m")
     top = max((float(track.clearance_m.min()) for track, _, _ in shown), default=1.0)
-    axes.set(ylabel="clearance [m]", ylim=(-0.3, max(3.0, 1.5 * top)))
+    axes.set(ylabel="clearance [m]", ylim=(-0.3, max(3.0, 2.0 * top)))
     _finish(axes)
 
 
