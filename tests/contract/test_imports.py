@@ -23,7 +23,7 @@ LAYERS = [
         "companion.config_traffic",
         "companion.config_types",
     },
-    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload"},
+    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload", "companion.tlog"},
     {
         "companion.tracking",
         "companion.safety",
@@ -34,7 +34,11 @@ LAYERS = [
     },
     {"companion.pilot"},
     {"companion.state"},
+    {"companion.log_files", "companion.foxglove", "companion.provenance"},
+    {"companion.log_writer"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
+    {"companion.scene"},
+    {"companion.scene_log"},
     {
         "companion.notices",
         "companion.confirm",
@@ -53,6 +57,7 @@ LAYERS = [
         "companion.publisher",
         "companion.doors",
     },
+    {"companion.logbook"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]
