@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import msgspec
 
@@ -25,12 +26,23 @@ STATUS_NS = NS_PER_S // 5
 FLUSH_NS = NS_PER_S
 
 
+class Watcher(Protocol):
+    """Whoever is shown the newest tick and status inside the daemon; must not raise."""
+
+    def tick(
+        self, record: wire.SetpointRecord, vehicle: VehicleState, output: PilotOutput | None, table: TrackTable
+    ) -> None: ...
+
+    def status(self, status: wire.Status) -> None: ...
+
+
 class Publisher:
     """Publishes and logs; the record goes out first, because in lockstep the simulator waits for it."""
 
     def __init__(self, zenoh: ZenohLink, recorder: Recorder | None) -> None:
         self._zenoh = zenoh
         self._recorder = recorder
+        self.watcher: Watcher | None = None
         self._hash = FlightHash()
         self._verdict = "silent"
         self._tracks = 0
@@ -64,6 +76,8 @@ class Publisher:
         self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle))
         if output is not None:
             self._offer("companion/tracks", vehicle.stamp_ns, lambda: tracks_out(output, table))
+        if self.watcher is not None:
+            self.watcher.tick(record, vehicle, output, table)
         self._hash.tick(state, vehicle, frames, output, table)
 
     def _offer(self, key: str, stamp_ns: int, build: Callable[[], msgspec.Struct]) -> None:
@@ -128,5 +142,7 @@ class Publisher:
             tick_ms=meter.quantiles_ms(last=1000),
         )
         self._zenoh.put("companion/status", status)
+        if self.watcher is not None:
+            self.watcher.status(status)
         if self._recorder is not None:
             self._recorder.message("/companion/status", vehicle_ns, wire.encode(status))

@@ -138,8 +138,14 @@ class Service:
     async def _serve_http(self, stack: contextlib.AsyncExitStack) -> None:
         """Whatever is read by HTTP; aiohttp is imported only where it serves."""
         from companion.http import HttpServer
+        from companion.page.access import Access
+        from companion.page.feed import PageFeed
+        from companion.page.handlers import Page
 
         server = HttpServer(self._config.http)
+        feed = PageFeed(self._session, self._route, self._inbox, self._transport, self._clock)
+        Page(server, feed, Access(self._config.http, self._doors), self._clock)
+        self._publisher.watcher = feed
         await server.start()
         stack.push_async_callback(server.stop)
 
