@@ -70,8 +70,12 @@ class Access:
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
         if scheme.lower() != "bearer" or not hmac.compare_digest(_digest(token.strip()), self._digest):
             self._strangers += 1
-            if self._strangers & (self._strangers - 1) == 0:  # the 1st, 2nd, 4th, ...: who guesses must not fill the log
-                log.warning("http: %s by %s without the token (%d times)", request.path, request.remote, self._strangers)
+            if (
+                self._strangers & (self._strangers - 1) == 0
+            ):  # the 1st, 2nd, 4th, ...: who guesses must not fill the log
+                log.warning(
+                    "http: %s by %s without the token (%d times)", request.path, request.remote, self._strangers
+                )
             answer = _reply(401, "expected the token of http.token_file")
             answer.headers["WWW-Authenticate"] = "Bearer"
             return answer

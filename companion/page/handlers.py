@@ -33,7 +33,7 @@ class Page:
     def __init__(self, server: HttpServer, feed: PageFeed, access: Access, clock: Clock) -> None:
         self._feed = feed
         self._clock = clock
-        self._watching: set[web.Request] = set()
+        self._watching: list[web.Request] = []
         for name, content in _files().items():
             server.add("GET", "/" if name == "index.html" else f"/{name}", _file(name, content))
         server.add("GET", "/feed", self._stream)
@@ -52,14 +52,14 @@ class Page:
         if len(self._watching) >= MAX_CLIENTS:
             raise web.HTTPServiceUnavailable(reason=f"expected at most {MAX_CLIENTS} who watch")
         socket = web.WebSocketResponse(timeout=SEND_S, heartbeat=HEARTBEAT_S, compress=False, max_msg_size=1024)
-        self._watching.add(request)
+        self._watching.append(request)
         sending = None
         try:
             await socket.prepare(request)
             sending = asyncio.create_task(self._send(request, socket))
             await socket.receive()  # a browser has nothing to say: whatever comes is the end
         finally:
-            self._watching.discard(request)
+            self._watching.remove(request)
             if sending is not None:
                 sending.cancel()
                 await asyncio.gather(sending, return_exceptions=True)

@@ -63,7 +63,8 @@ class PageTick(Struct, frozen=True, kw_only=True):
     detour: bool
     u_ref: Vec | None
     u_safe: Vec | None
-    binding: str | None  # the row with the least slack, in words
+    tightest: str | None  # the row with the least slack: whose, and which step
+    slack: float | None  # of that row [m/s^2]
     clearance: float | None  # to the nearest confirmed track
     epsilon: float | None  # of the obstacle row with the least slack
     epsilon_star: float | None
@@ -154,6 +155,7 @@ def page_tick(tick: Tick, drone_radius_m: float) -> PageTick:
     clearances = clearances_m(tick, drone_radius_m)
     shown = np.argsort(clearances, kind="stable")[:MAX_TRACKS].tolist()
     now = sample(tick, drone_radius_m)
+    worst = None if output is None else output.result.worst
     w, x, y, z = vehicle.q_enu_from_flu.tolist()
     return PageTick(
         t=now.t_s,
@@ -165,7 +167,8 @@ def page_tick(tick: Tick, drone_radius_m: float) -> PageTick:
         detour=output is not None and output.result.detour,
         u_ref=None if output is None else _rounded(output.u_ref),
         u_safe=None if output is None else _rounded(output.result.a_safe),
-        binding=None if output is None else _in_words(output.result.worst),
+        tightest=None if worst is None else _in_words(worst),
+        slack=None if worst is None else round(worst.slack, 3),
         clearance=now.clearance_m,
         epsilon=now.epsilon,
         epsilon_star=now.epsilon_star,
@@ -233,11 +236,8 @@ def _binding_obstacle(output: PilotOutput | None) -> RowRecord | None:
     return min(rows, key=lambda row: row.slack, default=None)
 
 
-def _in_words(row: RowRecord | None) -> str | None:
-    if row is None:
-        return None
-    step = "" if row.margin is None else ", braking distance" if row.step < 0 else f", step {row.step}"
-    return f"{row.track}{step}, slack {row.slack:.2f} m/s²"
+def _in_words(row: RowRecord) -> str:
+    return row.track + ("" if row.margin is None else ", braking" if row.step < 0 else f", step {row.step}")
 
 
 def _trusted(table: TrackTable) -> list[int]:

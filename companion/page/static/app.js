@@ -73,8 +73,14 @@ function theme(choice) {
   charts.draw();
 }
 
-const chosen = () => localStorage.getItem("companion-theme") || "auto";
-element("theme").addEventListener("change", (event) => { localStorage.setItem("companion-theme", event.target.value); theme(event.target.value); });
+// A browser that keeps nothing for us throws; the choice then lasts as long as the page.
+let choice = "auto";
+const chosen = () => { try { return localStorage.getItem("companion-theme") || choice; } catch { return choice; } };
+element("theme").addEventListener("change", (event) => {
+  choice = event.target.value;
+  try { localStorage.setItem("companion-theme", choice); } catch { /* kept above */ }
+  theme(choice);
+});
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => theme(chosen()));
 theme(chosen());
 connect();

@@ -2,7 +2,7 @@
 
 const SHAPES = { WAITING: "○", READY: "●", ACTIVE: "▶", HOLD: "■", OVERRIDDEN: "◆", FAULT: "✖" };
 const OLD_S = 1; // what was not heard for this long is marked
-const PARTS = [["radii", "radii"], ["cushion", "cushion"], ["sigma", "sigma"], ["delay", "delay"]];
+const PARTS = ["radii", "cushion", "sigma", "delay"];
 const MOST_OBSTACLES = 6;
 
 const element = (id) => document.getElementById(id);
@@ -66,7 +66,8 @@ export class Panels {
       ["velocity [m/s]", tick ? numbers(tick.v) : "–"],
       ["heading", tick ? `${heading.toFixed(0)}°` : "–"],
       ["target [m]", target],
-      ["binding", (tick && tick.binding) || "nothing"],
+      ["tightest row", (tick && tick.tightest) || "none"],
+      ["its slack", tick && tick.slack !== null ? `${tick.slack.toFixed(2)} m/s²` : "–"],
       ["profile", status ? `${status.profile}, ${Math.round(1000 / period_ms)} Hz` : "–"],
     ]);
   }
@@ -99,11 +100,12 @@ export class Panels {
     const tracks = tick ? tick.tracks.slice(0, MOST_OBSTACLES) : [], count = tick ? tick.tracks.length + tick.hidden : 0;
     element("no-obstacles").hidden = count > 0;
     write(element("tally"), tick ? `${count} obstacle${count === 1 ? "" : "s"}` : "");
-    const list = element("obstacles"), binding = tick && tick.binding ? tick.binding.split(",")[0] : "";
+    const list = element("obstacles"), binding = bound(tick);
     while (list.children.length > tracks.length) list.lastElementChild.remove();
+    const room = Math.max(1, ...tracks.map((track) => distance(track.keep_out)));
     tracks.forEach((track, i) => {
       const item = list.children[i] || list.appendChild(obstacleItem());
-      showObstacle(item, track, track.id === binding);
+      showObstacle(item, track, track.id === binding, room);
     });
   }
 
@@ -118,24 +120,33 @@ export class Panels {
   }
 }
 
+// The obstacle that changed the answer: that of the tightest row, where the reference did not pass unchanged.
+export function bound(tick) {
+  return tick && tick.tightest && tick.verdict !== "nominal" ? tick.tightest.split(",")[0] : "";
+}
+
+// D [m], the sum of its parts.
+function distance(keep) {
+  return keep ? PARTS.reduce((sum, part) => sum + keep[part], 0) : 0;
+}
+
 function obstacleItem() {
-  const bar = make("div", { class: "bar", "aria-hidden": "true" }, ...PARTS.map(([part]) => make("i", { class: part })));
-  const parts = make("div", { class: "parts" }, ...PARTS.map(([part]) => make("span", { class: part }, make("b", { "aria-hidden": "true" }), make("span"))));
+  const bar = make("div", { class: "bar", "aria-hidden": "true" }, ...PARTS.map((part) => make("i", { class: part })));
+  const parts = make("div", { class: "parts" }, ...PARTS.map((part) => make("span", { class: part }, make("b", { "aria-hidden": "true" }), make("span"))));
   return make("li", {}, make("div", { class: "name" }, make("span"), make("span")), bar, parts);
 }
 
-function showObstacle(item, track, binding) {
+function showObstacle(item, track, binding, room) {
   const [name, bar, parts] = item.children, keep = track.keep_out;
   write(name.children[0], track.status === "confirmed" ? track.id : `${track.id} (${track.status})`);
   name.children[0].classList.toggle("binding", binding);
   write(name.children[1], `${track.clearance.toFixed(2)} m clear`);
   bar.hidden = parts.hidden = !keep;
   if (!keep) return;
-  const total = PARTS.reduce((sum, [part]) => sum + keep[part], 0), room = Math.max(1.2, total);
-  PARTS.forEach(([part, label], i) => {
+  PARTS.forEach((part, i) => {
     bar.children[i].style.width = `${(100 * keep[part]) / room}%`;
-    write(parts.children[i].lastElementChild, `${label} ${keep[part].toFixed(2)}`);
+    write(parts.children[i].lastElementChild, `${part} ${keep[part].toFixed(2)}`);
   });
   if (!parts.children[PARTS.length]) parts.append(make("span"));
-  write(parts.children[PARTS.length], `= ${total.toFixed(2)} m, ${keep.step < 0 ? "braking" : `step ${keep.step}`}`);
+  write(parts.children[PARTS.length], `= ${distance(keep).toFixed(2)} m, ${keep.step < 0 ? "braking" : `step ${keep.step}`}`);
 }

@@ -33,7 +33,7 @@ const decimals = (step) => Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
 // plane: across(p), up(p) give the plane's coordinates of a world point; spread(c) its covariance [aa, ab, bb].
 export class Scene {
   constructor(canvas, camera, plane, paint) {
-    Object.assign(this, { camera, plane, paint }, prepare(canvas));
+    Object.assign(this, { camera, plane, paint, labels: [] }, prepare(canvas));
   }
 
   at(p) {
@@ -43,9 +43,9 @@ export class Scene {
   sx(a) { return this.width / 2 + (a - this.camera.a) * this.camera.scale; }
   sy(b) { return this.height / 2 - (b - this.camera.b) * this.camera.scale; }
 
-  grid(labels) {
+  grid() {
     const { context: c, width, height, camera, paint } = this;
-    const step = niceStep(width / camera.scale, width / 75), digits = decimals(step);
+    const step = niceStep(width / camera.scale, Math.max(6, width / 75)), digits = decimals(step);
     c.lineWidth = 1;
     c.strokeStyle = paint.grid;
     c.fillStyle = paint.quiet;
@@ -56,12 +56,16 @@ export class Scene {
     }
     for (let b = Math.ceil(bottom / step) * step; this.sy(b) > 0; b += step) {
       this.line([[0, this.sy(b)], [width, this.sy(b)]]);
-      if (this.sy(b) < height - 18) c.fillText(b.toFixed(digits), 3, this.sy(b) - 3);
+      if (this.sy(b) < height - 18 && this.sy(b) > 30) c.fillText(b.toFixed(digits), 3, this.sy(b) - 3);
     }
+  }
+
+  axes([across, up]) {
+    const { context: c, width, height, paint } = this;
     c.textAlign = "right";
-    c.fillText(labels[0], width - 5, height - 18);
+    this.text(across, width - 5, height - 18, paint.quiet, true);
     c.textAlign = "left";
-    c.fillText(labels[1], 5, 13);
+    this.text(up, 5, 13, paint.quiet, true);
   }
 
   line(points, close = false) {
@@ -80,7 +84,10 @@ export class Scene {
     c.setLineDash([9, 4, 2, 4]);
     c.strokeRect(x0, y1, x1 - x0, y0 - y1);
     c.setLineDash([]);
-    this.text("arena", x0 + 6, y1 + 15, paint.quiet);
+    const inside = (v, size) => v > 0 && v < size;
+    if (inside(x0, this.width) || inside(y1, this.height)) {
+      this.text("arena", Math.max(70, x0 + 6), Math.max(15, y1 + 15), paint.quiet, true);
+    }
   }
 
   trail(points) {
@@ -147,27 +154,29 @@ export class Scene {
     let inner = track.radius, outer = keep.radii;
     for (const [part, alpha] of [["radii", 0.3], ["cushion", 0.2], ["sigma", 0.26], ["delay", 0.14]]) {
       if (part !== "radii") { inner = outer; outer += keep[part]; }
-      c.globalAlpha = alpha;
+      c.globalAlpha = binding ? alpha : 0.35 * alpha;
       c.fillStyle = paint.keep;
       c.beginPath();
       c.arc(x, y, Math.max(0.1, outer * camera.scale), 0, 2 * Math.PI);
       c.arc(x, y, Math.max(0.1, Math.min(inner, outer) * camera.scale), 0, 2 * Math.PI, true);
       c.fill();
-      c.globalAlpha = 0.75;
+      c.globalAlpha = binding ? 0.75 : 0.4;
       c.strokeStyle = paint.keep;
       c.lineWidth = 0.75;
       this.disc(x, y, outer * camera.scale, null, paint.keep);
     }
-    c.globalAlpha = 1;
-    c.lineWidth = binding ? 3 : 1.5;
+    c.globalAlpha = binding ? 1 : 0.8;
+    c.lineWidth = binding ? 3 : 1.25;
+    c.setLineDash(binding ? [] : [6, 4]);
     this.disc(x, y, outer * camera.scale, null, paint.keep);
+    c.globalAlpha = 1;
     c.lineWidth = 1;
     c.setLineDash([2, 2]);
     this.disc(x, y, track.radius * camera.scale, null, paint.obstacle);
     c.setLineDash([]);
   }
 
-  obstacle(track, now) {
+  obstacle(track) {
     const { context: c, paint, camera } = this;
     const [x, y] = this.at(track.p), tentative = track.status === "tentative";
     if (track.path.length) {
@@ -179,16 +188,27 @@ export class Scene {
       c.setLineDash([]);
       c.lineCap = "butt";
     }
-    this.ellipse(x, y, this.plane.spread(track.covariance), 2);
     c.globalAlpha = tentative ? 0.35 : track.status === "coasting" ? 0.65 : 1;
     c.lineWidth = 1.5;
     this.disc(x, y, Math.max(3, track.radius * camera.scale), paint.obstacle, tentative ? paint.ink : null);
     c.globalAlpha = 1;
+    this.ellipse(x, y, this.plane.spread(track.covariance), 2);
     const speed = Math.hypot(...track.v);
     if (speed > 0.05) this.arrow(track.p, track.v, 0.5, paint.obstacle, 2);
-    const label = track.status === "confirmed" ? track.id : `${track.id} (${track.status})`;
-    const offset = Math.max(3, track.radius * camera.scale) * 0.75 + 4;
-    this.text(label, x + offset, y - offset, paint.ink, true);
+  }
+
+  // Beside the obstacle, where no other label is.
+  label(track) {
+    const words = track.status === "confirmed" ? track.id : `${track.id} (${track.status})`;
+    const [x, y] = this.at(track.p), gap = Math.max(3, track.radius * this.camera.scale) * 0.75 + 4;
+    const width = this.context.measureText(words).width;
+    const places = [[gap, -gap], [gap, gap + 10], [-gap - width, -gap], [-gap - width, gap + 10], [gap, -gap - 15], [gap, gap + 25]];
+    const boxes = places.map(([dx, dy]) => [x + dx, y + dy - 11, x + dx + width, y + dy + 3]);
+    const meets = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
+    const inside = (box) => box[0] >= 0 && box[2] <= this.width && box[1] >= 0 && box[3] <= this.height;
+    const box = boxes.find((one) => inside(one) && !this.labels.some((other) => meets(one, other))) || boxes[0];
+    this.labels.push(box);
+    this.text(words, box[0], box[3] - 3, this.paint.ink, true);
   }
 
   // An ellipse of k sigma of a 2x2 covariance.
@@ -196,11 +216,16 @@ export class Scene {
     const { context: c, paint, camera } = this;
     const mean = (aa + bb) / 2, root = Math.hypot((aa - bb) / 2, ab);
     const major = k * Math.sqrt(Math.max(0, mean + root)), minor = k * Math.sqrt(Math.max(0, mean - root));
-    c.strokeStyle = paint.sigma;
-    c.lineWidth = 1.75;
-    c.setLineDash([4, 3]);
     c.beginPath();
     c.ellipse(x, y, major * camera.scale, minor * camera.scale, -0.5 * Math.atan2(2 * ab, aa - bb), 0, 2 * Math.PI);
+    c.strokeStyle = paint.card; // it must be seen on the obstacle's disc as well as beside it
+    c.lineWidth = 3;
+    c.globalAlpha = 0.65;
+    c.stroke();
+    c.globalAlpha = 1;
+    c.strokeStyle = paint.sigma;
+    c.lineWidth = 1.5;
+    c.setLineDash([4, 2]);
     c.stroke();
     c.setLineDash([]);
   }

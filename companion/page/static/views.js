@@ -1,5 +1,6 @@
 // The plan (x east, y north) and the side view (along the route, altitude): what is in sight, and by which camera.
 
+import { bound } from "./panels.js";
 import { Scene, colours } from "./scene.js";
 
 const FIT_M = 14; // obstacles farther than this from the vehicle do not widen the view
@@ -45,10 +46,11 @@ export class Views {
     const shown = this.inSight(frame);
     if (this.auto) this.follow("plan", this.plan, shown.map((p) => [p[0], p[1]]), 1.2);
     const scene = new Scene(this.plan, this.cameras.plan, plane.plan, paint);
-    scene.grid(["east [m]", "north [m] ↑"]);
+    scene.grid();
     const [low, high] = frame.arena;
     scene.box([low[0], low[1]], [high[0], high[1]]);
     this.drawScene(scene, frame, frame.tick ? frame.tick.yaw : 0);
+    scene.axes(["east [m] →", "north [m] ↑"]);
     if (this.picked) scene.mark(this.picked);
     this.describe(frame);
   }
@@ -57,18 +59,19 @@ export class Views {
     this.turnAxis(frame);
     const seen = plane.side(this.axis.origin, this.axis.angle);
     const shown = this.inSight(frame).map((p) => [seen.across(p), seen.up(p)]);
-    this.follow("side", this.side, [...shown, [shown[0]?.[0] ?? 0, 0]], 0.6);
+    this.follow("side", this.side, [...shown, [shown[0]?.[0] ?? 0, 0], [shown[0]?.[0] ?? 0, 2.5]], 0.5);
     const scene = new Scene(this.side, this.cameras.side, seen, paint);
-    scene.grid([this.axis.label, "altitude [m]"]);
+    scene.grid();
     const [low, high] = frame.arena;
     scene.context.strokeStyle = paint.arena;
     scene.context.lineWidth = 1.5;
     scene.context.setLineDash([9, 4, 2, 4]);
     for (const z of [low[2], high[2]]) scene.line([[0, scene.sy(z)], [scene.width, scene.sy(z)]]);
     scene.context.setLineDash([]);
-    scene.text("floor", scene.width - 34, scene.sy(low[2]) - 3, paint.quiet);
+    scene.text("floor", scene.width - 34, scene.sy(low[2]) + 12, paint.quiet, true);
     const yaw = frame.tick ? frame.tick.yaw - this.axis.angle : 0;
     this.drawScene(scene, frame, Math.cos(yaw) >= 0 ? 0 : Math.PI);
+    scene.axes([`${this.axis.label} →`, "altitude [m] ↑"]);
   }
 
   drawScene(scene, frame, nose) {
@@ -76,11 +79,13 @@ export class Views {
     scene.trail(this.trail);
     if (!tick) return;
     scene.route(frame.route, tick.p);
-    const binding = tick.binding ? tick.binding.split(",")[0] : "";
+    const binding = bound(tick);
     const farFirst = [...tick.tracks].reverse();
-    farFirst.forEach((track) => scene.keepOut(track, track.id === binding));
+    for (const track of farFirst) if (track.id !== binding) scene.keepOut(track, false);
+    for (const track of farFirst) if (track.id === binding) scene.keepOut(track, true);
     farFirst.forEach((track) => scene.obstacle(track));
     scene.vehicle(tick, frame.drone_radius, nose);
+    tick.tracks.forEach((track) => scene.label(track));
     farFirst.forEach((track) => scene.outside(track, tick.p));
   }
 
@@ -95,13 +100,15 @@ export class Views {
 
   // Moves a camera towards one that shows all points with a border of so many metres.
   follow(name, canvas, points, border) {
-    const camera = this.cameras[name], firstTime = camera.scale === 0;
+    const camera = this.cameras[name], size = `${canvas.clientWidth}x${canvas.clientHeight}`;
+    const firstTime = camera.scale === 0 || camera.size !== size;
+    camera.size = size;
     const a = points.map((p) => p[0]), b = points.map((p) => p[1]);
     const [a0, a1, b0, b1] = [Math.min(...a) - border, Math.max(...a) + border, Math.min(...b) - border, Math.max(...b) + border];
     const width = Math.max(50, canvas.clientWidth), height = Math.max(50, canvas.clientHeight - 20);
     const wanted = { a: (a0 + a1) / 2, b: (b0 + b1) / 2, scale: Math.min(width / Math.max(4, a1 - a0), height / Math.max(2, b1 - b0), 160) };
     wanted.b -= 10 / wanted.scale; // the axis labels take their place at the bottom
-    const share = firstTime ? 1 : 0.12;
+    const share = firstTime ? 1 : 0.15;
     for (const key of ["a", "b", "scale"]) camera[key] += share * (wanted[key] - camera[key]);
   }
 
