@@ -10,12 +10,12 @@ import hashlib
 import hmac
 import logging
 from collections.abc import Callable
+from typing import Protocol
 
 import msgspec
 from aiohttp import web
 
 from companion.config_links import HttpConfig
-from companion.doors import Doors
 from companion.errors import ConfigError, FrameRejected
 from companion.http import same_origin
 from companion.link import wire
@@ -26,6 +26,14 @@ log = logging.getLogger("companion")
 MIN_TOKEN = 16  # characters
 
 
+class Commands(Protocol):
+    """What is commanded: `doors.Doors`."""
+
+    def engage(self, command: wire.EngageCommand) -> wire.Reply: ...
+
+    def target(self, command: wire.TargetCommand) -> wire.Reply: ...
+
+
 class Access:
     """The handlers of the commands.
 
@@ -33,7 +41,7 @@ class Access:
         ConfigError: ``http.token_file`` cannot be read, others may read it, or it holds no token.
     """
 
-    def __init__(self, config: HttpConfig, doors: Doors) -> None:
+    def __init__(self, config: HttpConfig, doors: Commands) -> None:
         self._doors = doors
         self._strangers = 0
         self._digest = _digest(read_token(config.token_file)) if config.commands and config.token_file else None
