@@ -13,7 +13,7 @@ const charts = new Charts(), panels = new Panels();
 const views = new Views((x, y) => controls.picked(x, y));
 const controls = new Controls(views);
 
-let socket = null, failures = 0, heard = null, opened = performance.now(), frame = null, drawn = false, count = 0, stale = false;
+let socket = null, failures = 0, heard = null, opened = performance.now(), frame = null, drawn = false, stale = false;
 
 function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/feed`);
@@ -42,7 +42,7 @@ function draw() {
   views.draw(frame, charts.trail());
   charts.draw(frame);
   controls.show(frame);
-  if (count++ % 2 === 0) panels.show(frame); // numbers that change ten times a second cannot be read
+  panels.show(frame);
 }
 
 // "No data since N s": of the daemon, else of the vehicle.

@@ -192,7 +192,7 @@ export class Scene {
     c.lineWidth = 1.5;
     this.disc(x, y, Math.max(3, track.radius * camera.scale), paint.obstacle, tentative ? paint.ink : null);
     c.globalAlpha = 1;
-    this.ellipse(x, y, this.plane.spread(track.covariance), 2);
+    this.ellipse(x, y, this.plane.spread(track.covariance), 2, track.radius);
     const speed = Math.hypot(...track.v);
     if (speed > 0.05) this.arrow(track.p, track.v, 0.5, paint.obstacle, 2);
   }
@@ -211,21 +211,25 @@ export class Scene {
     this.text(words, box[0], box[3] - 3, this.paint.ink, true);
   }
 
-  // An ellipse of k sigma of a 2x2 covariance.
-  ellipse(x, y, [aa, ab, bb], k) {
+  // An ellipse of k sigma of a 2x2 covariance, about an obstacle of this radius.
+  ellipse(x, y, [aa, ab, bb], k, radius) {
     const { context: c, paint, camera } = this;
     const mean = (aa + bb) / 2, root = Math.hypot((aa - bb) / 2, ab);
     const major = k * Math.sqrt(Math.max(0, mean + root)), minor = k * Math.sqrt(Math.max(0, mean - root));
+    if (major < radius && radius * camera.scale < 9) return; // it would only hide a small disc
     c.beginPath();
     c.ellipse(x, y, major * camera.scale, minor * camera.scale, -0.5 * Math.atan2(2 * ab, aa - bb), 0, 2 * Math.PI);
-    c.strokeStyle = paint.card; // it must be seen on the obstacle's disc as well as beside it
-    c.lineWidth = 3;
-    c.globalAlpha = 0.65;
-    c.stroke();
-    c.globalAlpha = 1;
-    c.strokeStyle = paint.sigma;
+    const hidden = major < radius; // on the obstacle's disc its own colour would not be seen
+    if (!hidden) {
+      c.strokeStyle = paint.card;
+      c.lineWidth = 3;
+      c.globalAlpha = 0.65;
+      c.stroke();
+      c.globalAlpha = 1;
+    }
+    c.strokeStyle = hidden ? paint.card : paint.sigma;
     c.lineWidth = 1.5;
-    c.setLineDash([4, 2]);
+    c.setLineDash([3, 2]);
     c.stroke();
     c.setLineDash([]);
   }
