@@ -15,8 +15,16 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from companion.config_check import check_arena, check_confirmation, check_reserve, check_ros2, check_tick, pointed
-from companion.config_links import MavlinkConfig, Ros2Config, ZenohConfig
+from companion.config_check import (
+    check_arena,
+    check_confirmation,
+    check_http,
+    check_reserve,
+    check_ros2,
+    check_tick,
+    pointed,
+)
+from companion.config_links import HttpConfig, MavlinkConfig, Ros2Config, ZenohConfig
 from companion.config_traffic import UNTRUSTED, TrafficConfig, check_traffic
 from companion.config_types import Acceleration, Name, NonNegative, Point, Positive, Section, SourceName, Stay
 from companion.errors import ConfigError
@@ -179,6 +187,7 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     disturbance: DisturbanceConfig = DisturbanceConfig()
     log: LogConfig = LogConfig()
     params: ParamsConfig = ParamsConfig()
+    http: HttpConfig = HttpConfig()
 
     @property
     def profile(self) -> Profile:
@@ -279,6 +288,7 @@ def parse_config(raw: Mapping[str, Any], *, source: str = "configuration") -> Co
     check_traffic(config.traffic, config.tracking.untrusted, source)
     check_arena(config.limits.arena_min, config.limits.arena_max, config.target.position, source)
     check_ros2((*config.ros2.detections, *config.ros2.tracked_objects), config.sync, source)
+    check_http(config.http.commands, config.http.token_file, source)
     if config.sync == "none" and config.lockstep_sources:
         raise ConfigError(f'{source}: lockstep_sources: expected only with sync = "lockstep"')
     return config
@@ -320,8 +330,9 @@ def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str
 
 
 def config_hash(config: Config) -> str:
-    """SHA-256 of the resolved configuration; where files lie is left out (it does not change the flight)."""
+    """SHA-256 of the resolved configuration, but for what changes no flight: where files lie, who may watch."""
     values = msgspec.to_builtins(config)
     values.pop("log")
     values.pop("params")
+    values.pop("http")
     return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()

@@ -62,3 +62,9 @@ def check_ros2(topics: tuple[str, ...], sync: str, source: str) -> None:
             raise ConfigError(f"{source}: ros2: expected each topic once, got /{name} {names.count(name)} times")
     if names and sync == "lockstep":
         raise ConfigError(f'{source}: ros2: expected no topics with sync = "lockstep"')
+
+
+def check_http(commands: bool, token_file: str | None, source: str) -> None:
+    """Raise ConfigError where anyone at all could command the vehicle by HTTP."""
+    if commands and token_file is None:
+        raise ConfigError(f"{source}: http.token_file: expected a file, http.commands = true needs a token")

@@ -1,4 +1,4 @@
-"""``[mavlink]``, ``[zenoh]`` and ``[ros2]``: where the daemon listens and to whom it talks."""
+"""``[mavlink]``, ``[zenoh]``, ``[ros2]`` and ``[http]``: where the daemon listens and to whom it talks."""
 
 from __future__ import annotations
 
@@ -62,3 +62,19 @@ class Ros2Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True)
     other_frame_ids: tuple[FrameId, ...] = ()  # that coincide with it, such as "odom"
     key_prefix: KeyPrefix = ""  # before the domain, where the nodes' session has a namespace
     type_hashes: tuple[TypeHash, ...] = ()  # of releases known to be laid out as the current ones
+
+
+HostName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?$")]
+
+
+class HttpConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The page, metrics and health by HTTP; whoever reaches the address may read them."""
+
+    enabled: bool = True
+    host: Annotated[str, Meta(min_length=1, max_length=253)] = "127.0.0.1"  # "0.0.0.0": every interface
+    port: Annotated[int, Meta(ge=0, le=65535)] | None = (
+        None  # None: 8080, or a free one if that is taken; 0: a free one
+    )
+    names: tuple[HostName, ...] = ()  # by which browsers may call this host, besides its addresses and localhost
+    commands: bool = False  # engage, release and set targets, for those who know the token
+    token_file: str | None = None  # one line of at least 16 characters, mode 0600

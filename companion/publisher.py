@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import msgspec
 
@@ -25,6 +26,16 @@ log = logging.getLogger("companion")
 STATUS_NS = NS_PER_S // 5
 
 
+class Watcher(Protocol):
+    """Whoever is shown the newest tick and status inside the daemon; must not raise."""
+
+    def tick(
+        self, record: wire.SetpointRecord, vehicle: VehicleState, output: PilotOutput | None, table: TrackTable
+    ) -> None: ...
+
+    def status(self, status: wire.Status) -> None: ...
+
+
 class Publisher:
     """Publishes and logs; the record goes out first, because in lockstep the simulator waits for it."""
 
@@ -32,6 +43,7 @@ class Publisher:
         self._zenoh = zenoh
         self._scenes = scenes
         self._recorder = recorder
+        self.watcher: Watcher | None = None
         self._hash = FlightHash()
         self._verdict = "silent"
         self._tracks = 0
@@ -76,6 +88,8 @@ class Publisher:
             self._offer("companion/tracks", vehicle.stamp_ns, lambda: tracks_out(output, table))
         if self._scenes is not None:
             self._scenes.tick(record, vehicle, output, table, target_enu)
+        if self.watcher is not None:
+            self.watcher.tick(record, vehicle, output, table)
         self._hash.tick(state, vehicle, frames, output, table)
 
     def _offer(self, key: str, stamp_ns: int, build: Callable[[], msgspec.Struct]) -> None:
@@ -140,5 +154,7 @@ class Publisher:
             tick_ms=meter.quantiles_ms(last=1000),
         )
         self._zenoh.put("companion/status", status)
+        if self.watcher is not None:
+            self.watcher.status(status)
         if self._recorder is not None:
             self._recorder.message("/companion/status", vehicle_ns, wire.encode(status))

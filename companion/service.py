@@ -126,6 +126,8 @@ class Service:
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
             self._publisher = Publisher(zenoh, recorder, scenes)
+            if config.http.enabled:
+                await self._serve_http(stack)
             gc.collect()
             gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
@@ -142,6 +144,20 @@ class Service:
         self._transport.on_packet = recorder.packet if config.log.tlog else None
         self._session.on_text = lambda severity, text: recorder.text(self._vehicle_ns, severity, text)
         return recorder, SceneLog(recorder, config, lambda: self._traffic.origin) if config.log.scene_hz > 0.0 else None
+
+    async def _serve_http(self, stack: contextlib.AsyncExitStack) -> None:
+        """Whatever is read by HTTP; aiohttp is imported only where it serves."""
+        from companion.http import HttpServer
+        from companion.page.access import Access
+        from companion.page.feed import PageFeed
+        from companion.page.handlers import Page
+
+        server = HttpServer(self._config.http)
+        feed = PageFeed(self._session, self._route, self._inbox, self._transport, self._clock)
+        Page(server, feed, Access(self._config.http, self._doors), self._clock)
+        self._publisher.watcher = feed
+        await server.start()
+        stack.push_async_callback(server.stop)
 
     async def _until_stopped(self) -> None:
         try:

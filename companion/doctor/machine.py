@@ -24,7 +24,7 @@ STEPS = 600
 WARM = 50  # steps not counted
 REACH_M = 6.0  # of the flight and the obstacles from the middle of the arena
 SOLUTION_TOLERANCE = 1e-4
-_SECRET_WORDS = ("key", "password", "secret", "credential", "users")
+_SECRET_WORDS = ("key", "password", "secret", "credential", "users", "token")
 _FILE_WORDS = ("file", "path")
 
 

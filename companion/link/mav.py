@@ -99,3 +99,21 @@ def message_name(message: int) -> str:
     'LOCAL_POSITION_NED'
     """
     return str(dialect.mavlink_map[message].msgname)
+
+
+_PX4_MAIN = {1: "MANUAL", 2: "ALTITUDE", 3: "POSITION", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED"}
+_PX4_AUTO = {2: "TAKEOFF", 3: "HOLD", 4: "MISSION", 5: "RETURN", 6: "LAND", 8: "FOLLOW", 9: "PRECISION LAND"}
+
+
+def mode_name(autopilot: int, custom_mode: int) -> str:
+    """A heartbeat's custom_mode in words (px4_custom_mode.h; COPTER_MODE of the dialect), else its number.
+
+    >>> mode_name(12, 6 << 16), mode_name(12, 4 << 16 | 3 << 24), mode_name(3, 17), mode_name(12, 99)
+    ('OFFBOARD', 'HOLD', 'BRAKE', '99')
+    """
+    if autopilot == 3:
+        entry = dialect.enums["COPTER_MODE"].get(custom_mode)
+        return str(custom_mode) if entry is None else str(entry.name).removeprefix("COPTER_MODE_")
+    main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
+    named = _PX4_AUTO.get(sub) if main == 4 else _PX4_MAIN.get(main)
+    return str(custom_mode) if named is None else named

@@ -69,7 +69,7 @@ class Router:
         self._clock = clock
         self._on_events = on_events
         self.on_packet: OnPacket | None = None  # told about each packet in or out, for a log
-        self.heard_ns: int | None = None  # when bytes last came on the autopilot's link, monotonic clock
+        self.heard_ns: list[int | None] = [None] * len(self._urls)  # when bytes last came on each, monotonic clock
         self._framers = [codec.new_framer() for _ in self._urls]
         self._routes = Routes(len(self._urls))
         self._links: tuple[Transport, ...] = ()
@@ -136,8 +136,7 @@ class Router:
     def _on_bytes(self, link: int, data: bytes) -> None:
         if not self._links:
             return  # while the others are being opened nobody is at home
-        if link == AUTOPILOT_LINK:
-            self.heard_ns = self._clock.monotonic_ns()
+        self.heard_ns[link] = self._clock.monotonic_ns()
         messages = self._framers[link].push(data)
         self._note((message.get_msgbuf() for message in messages), outgoing=False)
         self._on_events(self._codec.events([message for message in messages if self._take(link, message)]))

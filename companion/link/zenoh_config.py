@@ -11,7 +11,6 @@ import json
 import os
 import re
 import ssl
-import stat
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,9 @@ import zenoh
 from companion.config_links import ZenohConfig
 from companion.errors import ConfigError
 from companion.link.inbox import MAX_PAYLOAD_BYTES
+from companion.link.secret_file import read_secret
 
 MAX_MESSAGE_BYTES = 2 * MAX_PAYLOAD_BYTES  # a reassembled message; Zenoh's default of 1 GiB is a way to fill memory
-MAX_SECRET_BYTES = 1 << 20
 
 _TLS = "transport/link/tls"
 _USER = "transport/auth/usrpwd"
@@ -135,10 +134,10 @@ def _insert_user(settings: _Settings, config: ZenohConfig) -> None:
         raise ConfigError("zenoh.user: expected user and password_file together, got only one of them")
     values = settings.get(_USER)
     if values["password"] is not None and settings.file is not None:
-        _read_secret(settings.file, f"zenoh.config_file: {settings.file}: {_USER.replace('/', '.')}.password")
+        read_secret(settings.file, f"zenoh.config_file: {settings.file}: {_USER.replace('/', '.')}.password")
     if config.user is not None and config.password_file is not None:
         name = f"zenoh.password_file: {config.password_file}"
-        password = _read_secret(config.password_file, name).removesuffix("\n").removesuffix("\r")
+        password = read_secret(config.password_file, name).removesuffix("\n").removesuffix("\r")
         if not password or "\n" in password:
             raise ConfigError(f"{name}: expected one line, the password")
         values |= {"user": config.user, "password": password}
@@ -165,7 +164,7 @@ def _check_tls(settings: _Settings) -> None:
         key, certificate = tls[f"{side}_private_key"], tls[f"{side}_certificate"]
         if key is None or certificate is None:
             continue
-        _read_secret(key, f"{settings.name(f'{_TLS}/{side}_private_key')}: {key}")
+        read_secret(key, f"{settings.name(f'{_TLS}/{side}_private_key')}: {key}")
         name = settings.name(f"{_TLS}/{side}_certificate")
         try:
             context.load_cert_chain(certificate, key, password=lambda: "")  # "": never ask at the terminal
@@ -180,7 +179,7 @@ def _check_user(settings: _Settings, config: ZenohConfig) -> None:
     users = values["dictionary_file"]
     if users is not None:
         name = f"{settings.name(f'{_USER}/dictionary_file')}: {users}"
-        for number, line in enumerate(_read_secret(users, name).splitlines(), start=1):
+        for number, line in enumerate(read_secret(users, name).splitlines(), start=1):
             if not re.fullmatch(r"[^:]+:.+|\s*", line):
                 raise ConfigError(f"{name}: line {number}: expected user:password")
     elif values["user"] is not None and settings.get("listen/endpoints"):
@@ -195,29 +194,6 @@ def _check_client(settings: _Settings) -> None:
             f"zenoh.config_file: {settings.file}: connect.timeout_ms: expected at least 0 for a client"
             " (it would wait for its router without end, deaf to signals; a peer waits in the background)"
         )
-
-
-def _read_secret(path: str, name: str) -> str:
-    """The text of a file that only its owner may read. ``name`` heads the error; the content is never shown."""
-    try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # not even a FIFO keeps us waiting
-    except OSError as error:
-        raise ConfigError(f"{name}: cannot be read ({error.strerror}), expected a file of mode 0600") from None
-    with os.fdopen(fd, "rb") as file:
-        status = os.fstat(fd)
-        if not stat.S_ISREG(status.st_mode):
-            raise ConfigError(f"{name}: expected a regular file of mode 0600")
-        if status.st_mode & 0o177:
-            mode = stat.S_IMODE(status.st_mode)
-            raise ConfigError(f"{name}: expected mode 0600 or less (owner only), got {mode:04o}")
-        content = file.read(MAX_SECRET_BYTES + 1)
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError:
-        text = "\0"
-    if len(content) > MAX_SECRET_BYTES or "\0" in text:
-        raise ConfigError(f"{name}: expected text of at most {MAX_SECRET_BYTES} bytes")
-    return text
 
 
 def _ssl_reason(error: OSError) -> str:

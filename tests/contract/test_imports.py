@@ -56,8 +56,9 @@ LAYERS = [
         "companion.thinker",
         "companion.publisher",
         "companion.doors",
+        "companion.http",
     },
-    {"companion.logbook"},
+    {"companion.logbook", "companion.page"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]

@@ -143,3 +143,11 @@ def test_ten_seeds_reach_and_ten_controls_collide(tmp_path: Path) -> None:
     assert [status for status, _ in reports] == [0] * 10
     controls = [demo(tmp_path / f"none{seed}", "--seed", str(seed), "--filter", "none")[1] for seed in range(10)]
     assert sum(report["collided"] for report in controls) >= 8
+
+
+def test_nobody_can_watch_a_lockstep_flight(tmp_path: Path) -> None:
+    words = ["demo", "--lockstep", "--watch", "--out", str(tmp_path / "x")]
+    command = [sys.executable, "-m", "companion.cli", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "--watch: expected without --lockstep" in done.stderr
