@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import faulthandler
 import logging
 import os
 import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from companion import __version__
 from companion.errors import CompanionError, ConfigError
+from companion.logging_setup import LEVELS, set_up_logging
+
+if TYPE_CHECKING:
+    from companion.config import Config
 
 _EPILOG = """\
 examples:
@@ -23,6 +29,8 @@ examples:
   companion doctor -c configs/default.toml    is everything fit to fly, and what if the daemon dies?
   companion publish --orbit "center=1,2,1.5 radius=2 speed=1.5" --connect tcp/127.0.0.1:7447
                                               publish a made-up obstacle
+  companion monitor --connect tcp/127.0.0.1:7447
+                                              every vehicle on the network, in this terminal
 """
 
 
@@ -42,15 +50,18 @@ def build_parser() -> argparse.ArgumentParser:
     from companion.demo import command as demo
     from companion.doctor import command as doctor
     from companion.logbook import command as logbook
+    from companion.monitor import command as monitor
 
     demo.add_parser(commands)
     publish.add_parser(commands)
+    monitor.add_parser(commands)
     doctor.add_parser(commands)
     logbook.add_parser(commands)
     bench.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")
     schema.add_argument("key", nargs="?", help="one key suffix, such as companion/setpoint; all where left out")
     schema.add_argument("--keys", action="store_true", help="print every Zenoh key with its quality of service instead")
+    schema.add_argument("--metrics", action="store_true", help="print every metric of /metrics instead")
     schema.set_defaults(handler=_schema)
     return parser
 
@@ -86,36 +97,51 @@ def _add_run(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="override a key (repeatable)"
     )
     run.add_argument("--json", action="store_true", help="print a summary as one JSON object on stdout at the end")
-    run.add_argument("-v", "--verbose", action="store_true", help="log at debug level")
+    run.add_argument("--log-format", choices=("text", "json"), help="lines for people or for machines (log.format)")
+    run.add_argument("--log-level", choices=LEVELS, help="the least that is said on standard error (log.level)")
+    run.add_argument("-v", "--verbose", action="store_true", help="short for --log-level debug")
     run.set_defaults(handler=_run)
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from companion.clock import SystemClock
     from companion.config import load_config
-    from companion.service import Service
 
     config = load_config(arguments.config, tuple(arguments.overrides))
-    logging.basicConfig(
-        level=logging.DEBUG if arguments.verbose else logging.INFO,
-        stream=sys.stderr,
-        format="%(asctime)s %(levelname)s %(message)s",
-    )
-
-    async def serve() -> None:
-        service = Service(config, SystemClock())
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, service.stop)
-        summary = await service.run()
-        if arguments.json:
-            print(msgspec.json.encode(summary).decode(), flush=True)
-
-    asyncio.run(serve())
+    form = arguments.log_format or config.log.format
+    level = "debug" if arguments.verbose else arguments.log_level or config.log.level
+    set_up_logging(format=form, level=level, vehicle=config.vehicle.name)
+    faulthandler.enable()  # systemd's watchdog ends a stuck daemon by SIGABRT: where it was stuck is then told
+    try:
+        asyncio.run(_serve(config, as_json=arguments.json))
+    except Exception as error:
+        if form != "json":
+            raise
+        known = isinstance(error, CompanionError)
+        logging.getLogger("companion").critical("%s", error, exc_info=not known)
+        return 2 if isinstance(error, ConfigError) else 1
     return 0
 
 
+async def _serve(config: Config, *, as_json: bool) -> None:
+    from companion.clock import SystemClock
+    from companion.sdnotify import Notifier
+    from companion.service import Service
+
+    service = Service(config, SystemClock(), notifier=Notifier.from_environment(os.environ))
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, service.stop)
+    summary = await service.run()
+    if as_json:
+        print(msgspec.json.encode(summary).decode(), flush=True)
+
+
 def _schema(arguments: argparse.Namespace) -> int:
+    if arguments.metrics:
+        from companion.prometheus import metrics_page
+
+        print(metrics_page(), end="")
+        return 0
     if arguments.keys:
         from companion.link.keys import key_page
 

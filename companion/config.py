@@ -159,6 +159,8 @@ class ParamsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 class LogConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     directory: str | None = None  # None: no log
+    format: Literal["text", "json"] = "text"  # of what is said on standard error
+    level: Literal["debug", "info", "warning", "error", "critical"] = "info"  # the least that is said there
     max_mb: Annotated[float, Meta(ge=1.0, le=1e6)] = 512.0  # of one file; a longer flight goes on in the next
     keep_mb: Annotated[float, Meta(ge=1.0, le=1e8)] = 4096.0  # of all flights in the folder; the oldest are removed
     keep_files: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000

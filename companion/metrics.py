@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+# upper bounds of the latency histogram; 5, 10, 20, 50 ms are the periods of 200, 100, 50 and 20 Hz
+BUCKETS_MS = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0, 50.0)
 WINDOW = 100_000  # ticks that the quantiles look back on: bounds the memory of a long flight
 
 
@@ -19,6 +22,8 @@ class TickMeter:
         self.ticks = 0
         self._latencies_ms: deque[float] = deque(maxlen=WINDOW)
         self.verdicts: Counter[str] = Counter()
+        self.bucket_counts = [0] * (len(BUCKETS_MS) + 1)  # ticks by latency, the last above every bound
+        self.latency_sum_ms = 0.0
         self.deadline_misses = 0  # ticks whose work outlasted the period, and states skipped
         self.states_skipped = 0  # overtaken in the mailbox by a newer one
 
@@ -35,6 +40,8 @@ class TickMeter:
         """One tick: state received to setpoint sent, and to the end of all its work."""
         self.ticks += 1
         self._latencies_ms.append(latency_ms)
+        self.bucket_counts[bisect_left(BUCKETS_MS, latency_ms)] += 1
+        self.latency_sum_ms += latency_ms
         self.verdicts[verdict] += 1
         if busy_ms > self._period_ms:
             self.deadline_misses += 1

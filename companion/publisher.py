@@ -46,8 +46,8 @@ class Publisher:
         self.watcher: Watcher | None = None
         self._hash = FlightHash()
         self._verdict = "silent"
-        self._tracks = 0
-        self._agile: list[str] = []
+        self.tracks = 0  # of the last tick
+        self.agile: list[str] = []
         self._last: tuple[int, object] | None = None
 
     @property
@@ -58,6 +58,16 @@ class Publisher:
     @property
     def log_hash(self) -> str:
         return self._hash.hexdigest()
+
+    @property
+    def log_failure(self) -> str | None:
+        """Why the log is not written any more, or None."""
+        return None if self._recorder is None else self._recorder.failure
+
+    @property
+    def zenoh_counts(self) -> Mapping[str, int]:
+        """What came by Zenoh."""
+        return self._zenoh.counts
 
     def tick(
         self,
@@ -78,8 +88,8 @@ class Publisher:
         payload = wire.encode(record)
         self._zenoh.put_encoded("companion/setpoint", payload)
         table = tracks()
-        self._tracks = len(table)
-        self._agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
+        self.tracks = len(table)
+        self.agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
         if self._recorder is not None:
             self._recorder.frames(frames, vehicle.stamp_ns)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
@@ -126,6 +136,7 @@ class Publisher:
         target_enu: Vec3 | None,
         counts: Callable[[], Mapping[str, int]],
         meter: TickMeter,
+        sources: Callable[[], dict[str, wire.SourceOut]] = dict,
     ) -> None:
         """The status, at 5 Hz and whenever the situation or the target changed."""
         situation = session.situation
@@ -136,7 +147,8 @@ class Publisher:
             return
         self._last = (now_ns, key)
         if changed:
-            log.info("%s (%s)", situation.state, situation.reason)
+            told = {"state": situation.state.value, "reason": situation.reason, "t_ns": vehicle_ns}
+            log.info("%s (%s)", situation.state, situation.reason, extra=told)
         status = wire.Status(
             state=situation.state.value,
             reason=situation.reason,
@@ -147,11 +159,12 @@ class Publisher:
             profile=session.config.vehicle.profile,
             warnings=list(session.watch.notices.standing),
             target=target,
-            tracks=self._tracks,
-            agile=self._agile,
+            tracks=self.tracks,
+            agile=self.agile,
             verdict=self._verdict,
             counts=dict(counts()),
             tick_ms=meter.quantiles_ms(last=1000),
+            sources=sources(),
         )
         self._zenoh.put("companion/status", status)
         if self.watcher is not None:

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from companion.link.wire import MarginOut, RowOut, SetpointRecord, TrackOut, TracksOut, Vec, VehicleOut
+from companion.link.inbox import ObstacleInbox
+from companion.link.wire import MarginOut, RowOut, SetpointRecord, SourceOut, TrackOut, TracksOut, Vec, VehicleOut
 from companion.pilot import PilotOutput
 from companion.state import State
 from companion.types import DetectionFrame, RowRecord, TrackTable, Vec3, VehicleState, Verdict
@@ -95,6 +96,12 @@ def tracks_out(output: PilotOutput, table: TrackTable) -> TracksOut:
             for name, p, v, a, radius, covariance, mu, status, sources, surprise, growth in rows
         ],
     )
+
+
+def sources_out(inbox: ObstacleInbox, vehicle_ns: int) -> dict[str, SourceOut]:
+    """Every obstacle source with its age at ``vehicle_ns``."""
+    ages_s, frames = inbox.ages_s(vehicle_ns), inbox.accepted
+    return {name: SourceOut(age_s=age_s, frames=frames[name]) for name, age_s in sorted(ages_s.items())}
 
 
 class FlightHash:

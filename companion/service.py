@@ -33,14 +33,16 @@ from companion.parameters import with_stored
 from companion.pilot import Pilot, PilotOutput
 from companion.publisher import Publisher
 from companion.record import Recorder
-from companion.report import setpoint_record
+from companion.report import setpoint_record, sources_out
 from companion.route import Route
 from companion.scene_log import SceneLog
+from companion.sdnotify import Notifier
 from companion.session import VehicleSession
 from companion.state import FLYING
 from companion.thinker import Thinker
 from companion.timebase import TimeBase
 from companion.types import NS_PER_S, VehicleState
+from companion.vitals import Vitals
 
 log = logging.getLogger("companion")
 
@@ -52,7 +54,9 @@ RELEASE_NS = 6 * NS_PER_S // 10  # on shutdown in flight the autopilot is given 
 class Service:
     """One vehicle, one brain. ``run`` returns after ``stop``, and raises whatever else ended it."""
 
-    def __init__(self, config: Config, clock: Clock, *, pilot: Pilot | None = None) -> None:
+    def __init__(
+        self, config: Config, clock: Clock, *, pilot: Pilot | None = None, notifier: Notifier | None = None
+    ) -> None:
         base, config = config, with_stored(config)
         self._config = config
         self._clock = clock
@@ -97,6 +101,8 @@ class Service:
         self._services = Microservices(
             base, config, self._codec, self._session, clock, send=self._transport.send, retune=self._retune
         )
+        parts = self._session, self._meter, self._inbox, self._transport
+        self._vitals = Vitals(clock, notifier or Notifier(None), *parts, self._groups, lambda: self._vehicle_ns)
         self._wake = asyncio.Event()
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
@@ -120,6 +126,7 @@ class Service:
         config = self._config
         loop = asyncio.get_running_loop()
         async with contextlib.AsyncExitStack() as stack:
+            stack.callback(self._vitals.close)
             recorder, scenes = self._open_log(stack)
             await self._transport.open()
             stack.push_async_callback(self._transport.close)
@@ -130,6 +137,7 @@ class Service:
                 await self._serve_http(stack)
             gc.collect()
             gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
+            self._vitals.up(self._publisher)
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
@@ -151,11 +159,13 @@ class Service:
         from companion.page.access import Access
         from companion.page.feed import PageFeed
         from companion.page.handlers import Page
+        from companion.probes import add_probes
 
         server = HttpServer(self._config.http)
         feed = PageFeed(self._session, self._route, self._inbox, self._transport, self._clock)
         Page(server, feed, Access(self._config.http, self._doors), self._clock)
         self._publisher.watcher = feed
+        add_probes(server, self._vitals)
         await server.start()
         stack.push_async_callback(server.stop)
 
@@ -201,6 +211,7 @@ class Service:
                 self._thinker.observe_ahead(self._vehicle_ns, self._now_ns())
                 self._barrier.check_simulator(self._vehicle_ns)
             self._housekeeping()
+            self._vitals.beat()
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
             ):
@@ -209,6 +220,7 @@ class Service:
     def _begin_shutdown(self) -> int:
         """Hand the vehicle back: ask for the hold mode and stream until it is seen, for at most RELEASE_NS."""
         log.info("stopping")
+        self._vitals.stopping()
         if self._session.situation.state in FLYING:
             self._session.release(self._now_ns())
             self._flush()
@@ -302,14 +314,17 @@ class Service:
             target_enu=self._route.current,
             counts=self._counts,
             meter=self._meter,
+            sources=lambda: sources_out(self._inbox, self._vehicle_ns),
         )
+
+    def _groups(self) -> dict[str, dict[str, int]]:
+        groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
+        groups |= {"mavlink": self._codec.counts, "texts": self._session.text_counts}
+        return groups | {"autopilot": self._session.watch.counts, "timesync": self._time.counts}
 
     def _counts(self) -> dict[str, int]:
         """Everything counted, by kind."""
-        groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
-        groups |= {"mavlink": self._codec.counts, "texts": self._session.text_counts}
-        groups |= {"autopilot": self._session.watch.counts, "timesync": self._time.counts}
-        groups |= {"log": self._publisher.log_counts}
+        groups = self._groups() | {"log": dict(self._publisher.log_counts)}
         return self._meter.counts(groups) | self._transport.all_counts()
 
     def _summary(self, recorder: Recorder | None) -> Summary:

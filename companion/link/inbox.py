@@ -46,7 +46,8 @@ class ObstacleInbox:
         doors: sources of the daemon's own (`push_decoded`); what is published under their names is rejected.
         unix_ns: tells the time at which frames arrive, for the log.
 
-    ``counts`` has frames (accepted), dropped (queue full), thinned and every reason of rejection.
+    ``counts`` has frames (accepted), dropped (queue full), thinned and every reason of rejection; ``accepted`` the
+    frames of each source (of at most 64, the rest together as "").
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class ObstacleInbox:
         unix_ns: Callable[[], int | None] = lambda: None,
     ) -> None:
         self.counts: Counter[str] = Counter()
+        self.accepted: Counter[str] = Counter()
         self._queue = queue
         self._per_tick = per_tick
         self._max_age_s = max_age_s
@@ -146,6 +148,11 @@ class ObstacleInbox:
         entry = self._sources.get(source)
         return None if entry is None else entry.newest_stamp_ns
 
+    def ages_s(self, now_ns: int) -> dict[str, float | None]:
+        """Vehicle time since the stamp of the newest accepted frame of each source, configured or heard [s]."""
+        newest = {n: e.newest_stamp_ns for n, e in self._sources.items() if e.arrived or n in self._configured}
+        return {n: None if stamp_ns is None else (now_ns - stamp_ns) / NS_PER_S for n, stamp_ns in newest.items()}
+
     @property
     def sources(self) -> tuple[str, ...]:
         """Every source that has sent a frame, sorted."""
@@ -173,6 +180,7 @@ class ObstacleInbox:
                     self.reject(name, error)
                     continue
                 self.counts["frames"] += 1
+                self.accepted[name if name in self.accepted or len(self.accepted) < MAX_SOURCES else ""] += 1
                 entry.newest_stamp_ns = max(frame.stamp_ns, entry.newest_stamp_ns or frame.stamp_ns)
                 frames.append(frame)
         self._report(now_ns)

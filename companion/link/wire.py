@@ -162,6 +162,13 @@ class TracksOut(Struct, frozen=True, kw_only=True):
     tracks: list[TrackOut]
 
 
+class SourceOut(Struct, frozen=True, kw_only=True):
+    """An obstacle source, configured or heard."""
+
+    age_s: float | None  # vehicle time since the stamp of its newest accepted frame; None: none was
+    frames: int  # accepted since the daemon started
+
+
 class Status(Struct, frozen=True, kw_only=True):
     """`{prefix}/companion/status`, 5 Hz and on change."""
 
@@ -179,6 +186,7 @@ class Status(Struct, frozen=True, kw_only=True):
     verdict: str
     counts: dict[str, int]  # ticks by verdict, frames by reason of rejection
     tick_ms: dict[str, float]  # p50, p99, max of the last 1000 ticks
+    sources: dict[str, SourceOut] = {}
 
 
 T = TypeVar("T", bound=Struct)

@@ -36,8 +36,16 @@ LAYERS = [
     {"companion.state"},
     {"companion.log_files", "companion.foxglove", "companion.provenance"},
     {"companion.log_writer"},
-    {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
-    {"companion.scene"},
+    {
+        "companion.link",
+        "companion.metrics",
+        "companion.route",
+        "companion.report",
+        "companion.record",
+        "companion.sdnotify",
+        "companion.logging_setup",
+    },
+    {"companion.scene", "companion.prometheus", "companion.health", "companion.instruments"},
     {"companion.scene_log"},
     {
         "companion.notices",
@@ -58,8 +66,16 @@ LAYERS = [
         "companion.doors",
         "companion.http",
     },
-    {"companion.logbook", "companion.page"},
-    {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
+    {"companion.vitals", "companion.page", "companion.logbook"},
+    {"companion.probes"},
+    {
+        "companion.service",
+        "companion.publish",
+        "companion.monitor",
+        "companion.demo",
+        "companion.bench",
+        "companion.doctor",
+    },
     {"companion.cli"},
 ]
 BRAIN = (
