@@ -16,7 +16,7 @@ SAFETY_TESTS := tests/unit/test_safety_*.py tests/property/test_safety_propertie
 PILOT_TESTS := tests/unit/test_pilot.py tests/unit/test_disturbance.py tests/unit/test_retune.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow coverage mutants check format clean
+.PHONY: help demo test test-slow coverage mutants check format images clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' Makefile
@@ -63,6 +63,18 @@ check: $(VENV)/dev.stamp  ## lint, format check, types
 format: $(VENV)/dev.stamp  ## format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# docker 23 or newer, podman or buildah; podman and buildah keep the health check only with BUILD_FLAGS='--format docker'
+ENGINE ?= docker
+BUILD_FLAGS ?=
+VERSION := $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+REVISION = $(shell git rev-parse HEAD 2>/dev/null || echo unknown)
+BUILD = $(ENGINE) build $(BUILD_FLAGS) --build-arg REVISION=$(REVISION)
+
+images:  ## build the container images of docker/ (needs docker, or ENGINE=podman or buildah)
+	@command -v $(ENGINE) >/dev/null || { echo "make images: $(ENGINE) is not installed: expected docker, or ENGINE=podman or ENGINE=buildah" >&2; exit 1; }
+	$(BUILD) --file docker/companion.Dockerfile --tag companion:$(VERSION) .
+	$(BUILD) --file docker/simulator.Dockerfile --tag companion-simulator:$(VERSION) .
 
 clean:  ## remove the virtual environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage mutants

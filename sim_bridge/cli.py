@@ -18,6 +18,7 @@ from sim_bridge import bench, render
 from sim_bridge.check import check
 from sim_bridge.errors import ScenarioError, SimError
 from sim_bridge.flight import Flight
+from sim_bridge.links import Address
 from sim_bridge.lockstep_runner import Lockstep
 from sim_bridge.messages import NS_PER_S
 from sim_bridge.placement import Resolved, describe, resolve
@@ -64,14 +65,25 @@ def _parser() -> argparse.ArgumentParser:
         help="vehicle time over wall time, 0.01 to 100 (default 1); what the machine cannot keep is late_s",
     )
     run.add_argument("--stay", action="store_true", help="fly on after the end of the flight, until a signal")
+    run.add_argument("--must-reach", action="store_true", help="exit status 1 if the target has not been reached")
     run.add_argument("--onboard-port", type=_port, default=14540, help="UDP port of the companion (default 14540)")
     run.add_argument("--gcs-port", type=_port, default=14550, help="UDP port of the ground station (default 14550)")
-    run.add_argument(
+    for link, example in (("onboard", 14580), ("gcs", 18570)):
+        run.add_argument(
+            f"--{link}-bind",
+            type=_address,
+            metavar="HOST:PORT",
+            help="own address of that link, to which others may speak first, as with PX4 SITL: "
+            f"0.0.0.0:{example} from other hosts too (default: the loopback, any port)",
+        )
+    bus = run.add_mutually_exclusive_group()
+    bus.add_argument(
         "--zenoh-listen",
         default="tcp/127.0.0.1:7447",
         metavar="ENDPOINT",
         help="where Zenoh listens (default tcp/127.0.0.1:7447), or none",
     )
+    bus.add_argument("--zenoh-connect", metavar="ENDPOINT", help="the Zenoh router to be a client of, instead")
     run.add_argument(
         "--check", action="store_true", help="fly with a daemon for each vehicle; which of the expectations failed?"
     )
@@ -108,6 +120,13 @@ def _port(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 65535:
         raise argparse.ArgumentTypeError(f"expected a port, 1 to 65535, got {text}")
     return int(text)
+
+
+def _address(text: str) -> Address:
+    host, _, port = text.rpartition(":")
+    if not host:
+        raise argparse.ArgumentTypeError(f"expected HOST:PORT, got {text}")
+    return host, _port(port)
 
 
 def _speed(text: str) -> float:
@@ -151,7 +170,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, option):
             raise ScenarioError(f"--{option.replace('_', '-')}: expected --check with it")
     resolved = _resolved(arguments)
-    endpoint = None if arguments.zenoh_listen == _NO_ZENOH else arguments.zenoh_listen
+    endpoint = arguments.zenoh_connect or (None if arguments.zenoh_listen == _NO_ZENOH else arguments.zenoh_listen)
     if arguments.lockstep and endpoint is None:
         raise ScenarioError("--zenoh-listen none: expected an endpoint with --lockstep")
     if arguments.lockstep and arguments.speed != 1.0:
@@ -167,6 +186,9 @@ def _run(arguments: argparse.Namespace) -> int:
             endpoint=endpoint,
             prefix=None if arguments.name is None else f"uav/{arguments.name}",
             lockstep=arguments.lockstep,
+            onboard_bind=arguments.onboard_bind,
+            ground_bind=arguments.gcs_bind,
+            connect=arguments.zenoh_connect is not None,
         )
         stack.callback(wires.close)
         flight = Flight(resolved)
@@ -182,7 +204,8 @@ def _run(arguments: argparse.Namespace) -> int:
             stop.listen(runner.stop)
             summary = runner.run()
     _report(summary, as_json=arguments.json)
-    return FAILED if summary["collided"] or summary["ended"] == "timeout" else DONE
+    missed = arguments.must_reach and not summary["reached"]
+    return FAILED if summary["collided"] or summary["ended"] == "timeout" or missed else DONE
 
 
 def _check(arguments: argparse.Namespace) -> int:

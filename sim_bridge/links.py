@@ -1,9 +1,10 @@
 """The autopilot's two UDP links, as PX4 SITL has them, and the rules by which packets pass between them.
 
-Each link sends to 127.0.0.1:PORT from a socket of its own and answers whoever speaks to that socket. A packet that
-is not for the autopilot alone goes on to the other link: broadcasts always, addressed ones where the addressee was
-heard there. Nothing goes back to the link it came from, and nothing that claims to be the autopilot is passed on.
-Faults stand between a link and its socket, one `Channel` a direction; what they delay comes out of `release`.
+Each link sends to 127.0.0.1:PORT from a socket of its own, on the loopback unless it is bound elsewhere, and answers
+whoever speaks to that socket. A packet that is not for the autopilot alone goes on to the other one: broadcasts always,
+addressed ones where the addressee was heard there. Nothing goes back to the link it came from, and nothing that claims
+to be the autopilot is passed on. Faults stand between a link and its socket, one `Channel` a direction; what they delay
+comes out of `release`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from sim_bridge.mavlink import COMPONENT, Decoder, Encoder, Packet
 from sim_bridge.messages import LinkName, Sender
 
 TIMESYNC = 111
+_LOOPBACK = "127.0.0.1"
 _DATAGRAM = 65535
 _PER_DRAIN = 256  # so that a flood cannot keep the simulator from flying
 _PEERS = 8
@@ -27,9 +29,16 @@ Address: TypeAlias = tuple[str, int]
 
 
 class Link:
-    """One UDP endpoint: who listens there, whom we heard, our numbering of messages."""
+    """One UDP endpoint: who listens there, whom we heard, our numbering of messages.
 
-    def __init__(self, name: LinkName, port: int, host: str = "127.0.0.1", *, system: int = 1) -> None:
+    Args:
+        port: to which it sends unasked, on the loopback.
+        bind: address of its own socket, None: the loopback and any free port.
+    Raises:
+        OSError: ``bind`` is taken, or no address of this host.
+    """
+
+    def __init__(self, name: LinkName, port: int, *, bind: Address | None = None, system: int = 1) -> None:
         self.name = name
         self.port = port
         self.encoder = Encoder(system)
@@ -37,12 +46,16 @@ class Link:
         self.outbound: Channel[bytes] | None = None  # faults, where there are any
         self.inbound: Channel[bytes] | None = None
         self._corked: list[Passage[bytes]] | None = None
-        self._home: Address = (host, port)
+        self._home: Address = (_LOOPBACK, port)
         self._peers: list[Address] = []
         self._decoder = Decoder()
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
-        self.socket.bind((host, 0))
+        try:
+            self.socket.bind(bind or (_LOOPBACK, 0))
+        except OSError:
+            self.socket.close()
+            raise
 
     @property
     def damaged(self) -> int:
@@ -136,12 +149,28 @@ class Link:
 
 
 class Router:
-    """The two links of the autopilot of one vehicle, together; ``system`` is its MAVLink system id."""
+    """The two links of the autopilot of one vehicle, together; ``system`` is its MAVLink system id.
 
-    def __init__(self, onboard_port: int, ground_port: int, *, system: int = 1) -> None:
+    Raises:
+        OSError: of one of the links; neither is open then.
+    """
+
+    def __init__(
+        self,
+        onboard_port: int,
+        ground_port: int,
+        *,
+        onboard_bind: Address | None = None,
+        ground_bind: Address | None = None,
+        system: int = 1,
+    ) -> None:
         self.id = Sender(system, COMPONENT)
-        self.onboard = Link(LinkName.ONBOARD, onboard_port, system=system)
-        self.ground = Link(LinkName.GROUND, ground_port, system=system)
+        self.onboard = Link(LinkName.ONBOARD, onboard_port, bind=onboard_bind, system=system)
+        try:
+            self.ground = Link(LinkName.GROUND, ground_port, bind=ground_bind, system=system)
+        except OSError:
+            self.onboard.close()
+            raise
         self.links = (self.onboard, self.ground)
 
     def other(self, link: Link) -> Link:

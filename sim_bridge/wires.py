@@ -14,7 +14,7 @@ import numpy as np
 from sim_bridge.craft import Craft
 from sim_bridge.errors import ScenarioError
 from sim_bridge.impairments import Channel, damage_bytes
-from sim_bridge.links import Router
+from sim_bridge.links import Address, Router
 from sim_bridge.placement import Resolved
 from sim_bridge.scenario import SensorSpec, Vehicle
 from sim_bridge.sensors import Frame
@@ -78,8 +78,11 @@ class Wires:
         onboard_port, ground_port: of the first vehicle; the n-th has the n-th after it, unless the scenario says.
         endpoint: where Zenoh listens, None: no Zenoh.
         prefix: of the first vehicle's keys, None: ``uav/`` and its name.
+        onboard_bind, ground_bind: addresses of the links' own sockets, the n-th vehicle's port as above.
+        connect: ``endpoint`` is a Zenoh router's, of which the session is a client.
     Raises:
-        ScenarioError: two links with one port, a port above 65535, or an endpoint that cannot be listened on.
+        ScenarioError: two links with one port, a port above 65535, an address or endpoint that cannot be listened on,
+            or a router that does not answer.
     """
 
     def __init__(
@@ -91,6 +94,9 @@ class Wires:
         endpoint: str | None,
         lockstep: bool,
         prefix: str | None = None,
+        onboard_bind: Address | None = None,
+        ground_bind: Address | None = None,
+        connect: bool = False,
     ) -> None:
         scenario = resolved.scenario
         ports = ports_of(resolved, onboard_port, ground_port)
@@ -99,12 +105,13 @@ class Wires:
             self._wake_in, self._wake_out = (self._stack.enter_context(s) for s in socket.socketpair())
             self._wake_in.setblocking(False)
             self._wake_out.setblocking(False)
-            session = None if endpoint is None else Session(endpoint, self._wake_out)
+            session = None if endpoint is None else Session(endpoint, self._wake_out, connect=connect)
             if session is not None:
                 self._stack.callback(session.close)
             crafts = []
             for index, (vehicle, (onboard, ground)) in enumerate(zip(scenario.fleet, ports, strict=True)):
-                router = Router(onboard, ground, system=vehicle.system_id)
+                binds = _nth(onboard_bind, index), _nth(ground_bind, index)
+                router = _router(onboard, ground, binds, system=vehicle.system_id)
                 self._stack.callback(router.close)
                 feeds = tuple(Feed(spec) for _, spec in scenario.carried(vehicle.name))
                 own = prefix if prefix is not None and index == 0 else f"uav/{vehicle.name}"
@@ -131,6 +138,21 @@ class Wires:
 
     def close(self) -> None:
         self._stack.close()
+
+
+def _nth(address: Address | None, index: int) -> Address | None:
+    """The address of the vehicle ``index``: as many ports on."""
+    return None if address is None else (address[0], address[1] + index)
+
+
+def _router(onboard: int, ground: int, binds: tuple[Address | None, Address | None], *, system: int) -> Router:
+    try:
+        return Router(onboard, ground, onboard_bind=binds[0], ground_bind=binds[1], system=system)
+    except (OSError, OverflowError) as error:  # Overflow: a port above 65535
+        wanted = ", ".join(f"{host}:{port}" for host, port in filter(None, binds))
+        raise ScenarioError(
+            f"--onboard-bind, --gcs-bind: expected free addresses of this host, got {wanted} ({error})"
+        ) from None
 
 
 def ports_of(resolved: Resolved, onboard_port: int, ground_port: int) -> list[tuple[int, int]]:

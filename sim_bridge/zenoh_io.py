@@ -58,10 +58,10 @@ _RECORDS = msgspec.json.Decoder(Record)
 LEAST_STD_M = 0.001  # a sensor without noise still states a deviation above 0
 
 
-def session_config(listen: Sequence[str], connect: Sequence[str] = ()) -> zenoh.Config:
-    """A peer that finds nobody by itself: no multicast, no gossip."""
+def session_config(listen: Sequence[str], connect: Sequence[str] = (), mode: str = "peer") -> zenoh.Config:
+    """A peer, or a router's client, that finds nobody by itself: no multicast, no gossip."""
     config = zenoh.Config()
-    config.insert_json5("mode", '"peer"')
+    config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
     config.insert_json5("listen/endpoints", json.dumps(list(listen)))
@@ -82,16 +82,20 @@ class Session:
     Args:
         endpoint: where to listen, e.g. ``tcp/127.0.0.1:7447``.
         wake: written to (one byte) whenever something has come in.
+        connect: be a client of the router at ``endpoint`` instead.
     Raises:
-        ScenarioError: the endpoint cannot be listened on.
+        ScenarioError: the endpoint cannot be listened on, or no router answers there.
     """
 
-    def __init__(self, endpoint: str, wake: socket.socket) -> None:
+    def __init__(self, endpoint: str, wake: socket.socket, *, connect: bool = False) -> None:
         self._wake = wake
         try:
-            self.zenoh = zenoh.open(session_config([endpoint]))
+            config = session_config([], [endpoint], mode="client") if connect else session_config([endpoint])
+            self.zenoh = zenoh.open(config)
         except zenoh.ZError as error:
-            raise ScenarioError(f"--zenoh-listen {endpoint}: cannot listen there ({_first_words(error)})") from None
+            what = "--zenoh-connect" if connect else "--zenoh-listen"
+            why = "no Zenoh router answers" if connect else "cannot listen"
+            raise ScenarioError(f"{what} {endpoint}: {why} there ({_first_words(error)})") from None
 
     def poke(self) -> None:
         """Wake the main loop, from any thread."""

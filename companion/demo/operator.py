@@ -1,7 +1,8 @@
 """The operator of the demo: MAVSDK on the simulator's ground station link, as a person with a ground station would.
 
-Run as a process of its own (``python -m companion.demo.operator PORT X Y Z``), because MAVSDK cannot be left while
-one of its calls waits for an answer. Prints each step as it begins; exit status 1 and one line on standard error if
+Run as a process of its own (``python -m companion.demo.operator LINK X Y Z``; LINK is a UDP port of the loopback or a
+MAVSDK connection such as ``udpout://simulator:18570``), because MAVSDK cannot be left while one of its calls waits for
+an answer. Prints each step as it begins; exit status 1 and one line on standard error if
 one fails. Never MAVSDK's Offboard plugin: it streams setpoints of its own beside the daemon's.
 """
 
@@ -33,24 +34,28 @@ class OperatorError(CompanionError):
 
 
 async def take_off_and_engage(
-    gcs_port: int, target_enu: tuple[float, float, float], on_step: Callable[[str], None]
+    connection: str, target_enu: tuple[float, float, float], on_step: Callable[[str], None]
 ) -> None:
     """Connect, wait for health, arm, take off, wait for the hover, engage the companion, watch until ended.
 
     Raises:
-        OperatorError: a step was refused or timed out.
+        OperatorError: a connection that cannot be used, or a step that was refused or timed out.
     """
     from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
+    from mavsdk.asyncio.exceptions import MavsdkConnectionError
 
     # MAVSDK blocks executor threads while it waits for acknowledgements
     asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(max_workers=8))
     configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
     async with Mavsdk(configuration) as mavsdk:
         on_step("connect")
-        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gcs_port}")
+        try:
+            await mavsdk.add_any_connection(connection)
+        except MavsdkConnectionError as error:
+            raise OperatorError(f"operator: {connection}: {error}") from None
         system = await mavsdk.first_autopilot(timeout_s=CONNECT_S)
         if system is None:
-            raise OperatorError(f"operator: no autopilot on UDP port {gcs_port} within {CONNECT_S:g} s")
+            raise OperatorError(f"operator: no autopilot on {connection} within {CONNECT_S:g} s")
         await _fly(system, on_step)
         await _watch(system, target_enu, on_step)
 
@@ -146,7 +151,7 @@ async def _until(updates: AsyncIterator[T], accept: Callable[[T], bool], step: s
 
 
 def main(arguments: list[str]) -> int:
-    """Fly as the operator on the UDP port given, to the target given; MAVSDK's messages go to standard error."""
+    """Fly as the operator on the link given, to the target given; MAVSDK's messages go to standard error."""
     from mavsdk.logging import log_subscribe
 
     def write(level: Any, message: str, file: str | None, line: int) -> bool:
@@ -155,8 +160,9 @@ def main(arguments: list[str]) -> int:
 
     log_subscribe(write)
     try:
-        port, x, y, z = int(arguments[0]), *(float(word) for word in arguments[1:4])
-        asyncio.run(take_off_and_engage(port, (x, y, z), lambda step: print(step, flush=True)))
+        link, (x, y, z) = arguments[0], (float(word) for word in arguments[1:4])
+        connection = f"udpin://127.0.0.1:{link}" if link.isdecimal() else link
+        asyncio.run(take_off_and_engage(connection, (x, y, z), lambda step: print(step, flush=True)))
     except OperatorError as error:
         print(error, file=sys.stderr)
         return 1
