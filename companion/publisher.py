@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 import msgspec
 
 from companion.config import Config
+from companion.journal import Journal
 from companion.link import wire
 from companion.link.zenoh import ZenohLink
 from companion.metrics import TickMeter
@@ -28,9 +29,10 @@ FLUSH_NS = NS_PER_S
 class Publisher:
     """Publishes and logs; the record goes out first, because in lockstep the simulator waits for it."""
 
-    def __init__(self, zenoh: ZenohLink, recorder: Recorder | None) -> None:
+    def __init__(self, zenoh: ZenohLink, recorder: Recorder | None, journal: Journal | None = None) -> None:
         self._zenoh = zenoh
         self._recorder = recorder
+        self._journal = journal
         self._hash = FlightHash()
         self._verdict = "silent"
         self._tracks = 0
@@ -59,7 +61,8 @@ class Publisher:
         self._tracks = len(table)
         self._agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
         if self._recorder is not None:
-            self._recorder.frames(frames, vehicle.stamp_ns)
+            if self._journal is not None:
+                self._journal.write(self._recorder, frames)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
         self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle))
         if output is not None:
@@ -88,6 +91,8 @@ class Publisher:
             return None
         if now_ns - self._flushed_ns >= FLUSH_NS:
             self._flushed_ns = now_ns
+            if self._journal is not None:
+                self._journal.write(self._recorder)
             self._recorder.flush()
         return self._recorder.failure
 

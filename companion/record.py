@@ -2,8 +2,8 @@
 
 Topics: ``/companion/config`` (resolved configuration, its hash and version: first, and again when live parameters
 change), ``/companion/input/obstacles`` (frames as the brain consumed them, vehicle clock, ENU),
-``/companion/vehicle``, ``/companion/setpoint``, ``/companion/tracks``, ``/companion/status``. Times are nanoseconds
-of the vehicle's clock.
+``/companion/brain`` (every call of the shell into the brain, see `journal`), ``/companion/vehicle``,
+``/companion/setpoint``, ``/companion/tracks``, ``/companion/status``. Times are nanoseconds of the vehicle's clock.
 """
 
 from __future__ import annotations
@@ -17,11 +17,10 @@ from typing import Any
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from companion import __version__
+from companion import __version__, journal_format
 from companion.config import Config, config_hash
 from companion.errors import ConfigError
 from companion.link.wire import OUTGOING, ObstacleFrame
-from companion.types import DetectionFrame
 
 CHUNK_BYTES = 65536  # what the writer holds back between two flushes at most
 
@@ -71,11 +70,6 @@ class Recorder:
         except OSError as error:
             self._fail(error)
 
-    def frames(self, frames: tuple[DetectionFrame, ...], tick_ns: int) -> None:
-        """Append the obstacle frames that a tick consumed."""
-        for frame in frames:
-            self.message("/companion/input/obstacles", tick_ns, _ENCODER.encode(_frame_json(frame)))
-
     def flush(self) -> None:
         """Write the chunk in progress and hand it to the system, which keeps it when this process is killed."""
         if not self._open:
@@ -108,6 +102,9 @@ class Recorder:
             self._register(f"/{suffix}", OUTGOING[suffix].__name__, msgspec.json.schema(OUTGOING[suffix]))
         self._register("/companion/input/obstacles", "ObstacleFrame", msgspec.json.schema(ObstacleFrame))
         self._register("/companion/config", "Config", {"type": "object"})
+        self._register(
+            journal_format.TOPIC, "BrainCall", {"type": "object", **msgspec.json.schema(journal_format.Call)}
+        )
 
     def _register(self, topic: str, name: str, schema: dict[str, Any]) -> None:
         schema_id = self._writer.register_schema(name=name, encoding="jsonschema", data=_ENCODER.encode(schema))
@@ -121,30 +118,3 @@ def _create(path: Path) -> BufferedWriter:
         with contextlib.suppress(FileExistsError):
             return name.open("xb")
     raise AssertionError("itertools.count ends")
-
-
-def _frame_json(frame: DetectionFrame) -> dict[str, Any]:
-    return {
-        "stamp_ns": frame.stamp_ns,
-        "clock": "vehicle",
-        "frame": "local_enu",
-        "source": frame.source,
-        "sequence": frame.sequence,
-        "kind": frame.kind.value,
-        "obstacles": [
-            {
-                "id": seen.id,
-                "position": seen.p_enu.tolist(),
-                "radius": seen.radius_m,
-                "position_std": seen.p_std_m,
-                "velocity": None if seen.v_enu is None else seen.v_enu.tolist(),
-                "velocity_std": seen.v_std_m_s,
-                "covariance": None if seen.covariance is None else _upper(seen.covariance.tolist()),
-            }
-            for seen in frame.detections
-        ],
-    }
-
-
-def _upper(matrix: list[list[float]]) -> list[float]:
-    return [value for i, row in enumerate(matrix) for value in row[i:]]

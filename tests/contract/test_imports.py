@@ -32,7 +32,9 @@ LAYERS = [
         "companion.disturbance",
         "companion.origin",
     },
-    {"companion.pilot"},
+    {"companion.numerics", "companion.pilot"},
+    {"companion.journal_format"},
+    {"companion.journal"},
     {"companion.state"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
     {
