@@ -55,6 +55,9 @@ LAYERS = [
         "companion.publisher",
         "companion.doors",
     },
+    {"companion.logbook"},
+    {"companion.replay"},
+    {"companion.explain"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]
