@@ -1,14 +1,17 @@
 """The brain's journal: every call of the shell into the brain, in order, so that a flight can be replayed to the bit.
 
 Each call is one message on ``/companion/brain`` (`journal_format`). ``n`` counts them without gaps from the first: a
-message that the log lost shows. Nothing is encoded while a setpoint waits: `Journal` keeps the values, which are
-frozen, until `Journal.write`.
+message that the log lost shows. Nothing is built or encoded while a setpoint waits: `Journal` keeps the values, which
+are frozen, until `Journal.write`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
+
+from msgspec import Struct
 
 from companion import __version__
 from companion.config import Config, config_hash
@@ -21,8 +24,7 @@ from companion.journal_format import (
     Observe,
     Reset,
     Retune,
-    encode_call,
-    encode_frame,
+    frame_of,
     names_of,
     step_of,
 )
@@ -30,11 +32,13 @@ from companion.numerics import this_machine
 from companion.pilot import PilotInput, PilotOutput
 from companion.types import DetectionFrame, TrackTable
 
+FRAME_BYTES = 200  # about what a detection takes until it is written
+
 
 class Sink(Protocol):
-    """Where messages go: the recorder."""
+    """Where messages go: the recorder, which builds and encodes them when nobody waits."""
 
-    def message(self, topic: str, stamp_ns: int, payload: bytes) -> None: ...
+    def later(self, topic: str, stamp_ns: int, build: Callable[[], Struct], size: int = ...) -> None: ...
 
 
 class Brain(Protocol):
@@ -109,7 +113,7 @@ class Journal:
         """Append what was noted since the last time, and the ``frames`` of a tick for which no brain was asked."""
         for stamp_ns, make, used in self._notes:
             self._write_frames(sink, used, stamp_ns)
-            sink.message(TOPIC, stamp_ns, encode_call(make(self._number)))
+            sink.later(TOPIC, stamp_ns, partial(make, self._number))
             self._number += 1
         self._notes.clear()
         self._write_frames(sink, frames, self._stamp_ns)
@@ -118,7 +122,7 @@ class Journal:
         if frames and frames is not self._written:
             self._written = frames
             for frame in frames:
-                sink.message(FRAMES_TOPIC, stamp_ns, encode_frame(frame))
+                sink.later(FRAMES_TOPIC, stamp_ns, partial(frame_of, frame), FRAME_BYTES * (1 + len(frame.detections)))
 
     def _note(self, make: Callable[[int], Call], frames: tuple[DetectionFrame, ...] = ()) -> None:
         self._notes.append((self._stamp_ns, make, frames))

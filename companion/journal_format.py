@@ -119,18 +119,18 @@ class SeenFrame(Struct, frozen=True, kw_only=True):
     source: str
     sequence: int
     kind: DetectionKind
+    arrived_unix_ns: int | None = None  # here; no part of the brain's input
     obstacles: list[Seen]
 
 
-_ENCODER = msgspec.json.Encoder()
 _CALLS: msgspec.json.Decoder[Call] = msgspec.json.Decoder(Call)
 _FRAMES = msgspec.json.Decoder(SeenFrame)
 _UPPER = np.triu_indices(6)
 
 
-def encode_call(call: Call) -> bytes:
-    """A call as a message of `TOPIC`."""
-    return _ENCODER.encode(call)
+def schema() -> dict[str, Any]:
+    """JSON Schema of the messages of `TOPIC`."""
+    return {"type": "object", **msgspec.json.schema(Call)}
 
 
 def decode_call(payload: bytes) -> Call:
@@ -148,11 +148,16 @@ def decode_frame(payload: bytes) -> DetectionFrame:
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise CompanionError(f"{FRAMES_TOPIC}: {error}") from None
     return DetectionFrame(
-        frame.stamp_ns, frame.source, frame.sequence, frame.kind, tuple([_detection(seen) for seen in frame.obstacles])
+        stamp_ns=frame.stamp_ns,
+        source=frame.source,
+        sequence=frame.sequence,
+        kind=frame.kind,
+        detections=tuple([_detection(seen) for seen in frame.obstacles]),
+        arrived_unix_ns=frame.arrived_unix_ns,
     )
 
 
-def encode_frame(frame: DetectionFrame) -> bytes:
+def frame_of(frame: DetectionFrame) -> SeenFrame:
     """A frame as a message of `FRAMES_TOPIC`."""
     seen = [
         Seen(
@@ -166,16 +171,15 @@ def encode_frame(frame: DetectionFrame) -> bytes:
         )
         for one in frame.detections
     ]
-    return _ENCODER.encode(
-        SeenFrame(
-            stamp_ns=frame.stamp_ns,
-            clock="vehicle",
-            frame="local_enu",
-            source=frame.source,
-            sequence=frame.sequence,
-            kind=frame.kind,
-            obstacles=seen,
-        )
+    return SeenFrame(
+        stamp_ns=frame.stamp_ns,
+        clock="vehicle",
+        frame="local_enu",
+        source=frame.source,
+        sequence=frame.sequence,
+        kind=frame.kind,
+        arrived_unix_ns=frame.arrived_unix_ns,
+        obstacles=seen,
     )
 
 

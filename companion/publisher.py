@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 
 import msgspec
 
+from companion import journal_format
 from companion.config import Config
 from companion.journal import Journal
 from companion.link import wire
@@ -23,7 +24,6 @@ from companion.types import NS_PER_S, DetectionFrame, TrackTable, Vec3, VehicleS
 log = logging.getLogger("companion")
 
 STATUS_NS = NS_PER_S // 5
-FLUSH_NS = NS_PER_S
 
 
 class Publisher:
@@ -33,12 +33,18 @@ class Publisher:
         self._zenoh = zenoh
         self._recorder = recorder
         self._journal = journal
+        if recorder is not None and journal is not None:
+            recorder.declare(journal_format.TOPIC, "BrainCall", journal_format.schema())
         self._hash = FlightHash()
         self._verdict = "silent"
         self._tracks = 0
         self._agile: list[str] = []
-        self._flushed_ns = 0
         self._last: tuple[int, object] | None = None
+
+    @property
+    def log_counts(self) -> Mapping[str, int]:
+        """Messages that did not get into the log; empty without one."""
+        return {} if self._recorder is None else self._recorder.counts
 
     @property
     def log_hash(self) -> str:
@@ -52,8 +58,12 @@ class Publisher:
         frames: tuple[DetectionFrame, ...],
         output: PilotOutput | None,
         tracks: Callable[[], TrackTable],
+        arrived_unix_ns: int | None = None,
     ) -> None:
-        """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left."""
+        """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left.
+
+        ``arrived_unix_ns``: when the vehicle state came.
+        """
         self._verdict = record.verdict
         payload = wire.encode(record)
         self._zenoh.put_encoded("companion/setpoint", payload)
@@ -64,7 +74,7 @@ class Publisher:
             if self._journal is not None:
                 self._journal.write(self._recorder, frames)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
-        self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle))
+        self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle, arrived_unix_ns))
         if output is not None:
             self._offer("companion/tracks", vehicle.stamp_ns, lambda: tracks_out(output, table))
         self._hash.tick(state, vehicle, frames, output, table)
@@ -72,29 +82,27 @@ class Publisher:
     def _offer(self, key: str, stamp_ns: int, build: Callable[[], msgspec.Struct]) -> None:
         """Build and encode once for whoever wants it: subscribers, the log, or nobody."""
         wanted = self._zenoh.wanted(key)
-        if not wanted and self._recorder is None:
-            return
-        payload = wire.encode(build())
         if wanted:
+            payload = wire.encode(build())
             self._zenoh.put_encoded(key, payload)
-        if self._recorder is not None:
-            self._recorder.message(f"/{key}", stamp_ns, payload)
+            if self._recorder is not None:
+                self._recorder.message(f"/{key}", stamp_ns, payload)
+        elif self._recorder is not None:
+            self._recorder.later(f"/{key}", stamp_ns, build)
 
     def configured(self, config: Config, stamp_ns: int) -> None:
         """The profile is settled, or live parameters changed: the log says what holds from here on."""
         if self._recorder is not None:
             self._recorder.config(config, stamp_ns)
 
-    def keep_log(self, now_ns: int) -> str | None:
-        """Flush the log once a second; why it is not written any more, or None."""
+    def keep_log(self) -> str | None:
+        """The tick is over: let the log be written. What has befallen it since the last call, or None."""
         if self._recorder is None:
             return None
-        if now_ns - self._flushed_ns >= FLUSH_NS:
-            self._flushed_ns = now_ns
-            if self._journal is not None:
-                self._journal.write(self._recorder)
-            self._recorder.flush()
-        return self._recorder.failure
+        if self._journal is not None:
+            self._journal.write(self._recorder)
+        self._recorder.kick()
+        return self._recorder.trouble()
 
     def status(
         self,

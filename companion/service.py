@@ -69,6 +69,7 @@ class Service:
             sources=(*config.lockstep_sources, *config.obstacles.required),
             on_report=log.warning,
             doors=config.traffic.open_doors,
+            unix_ns=clock.unix_ns,
         )
         self._traffic = TrafficDoors(
             config.traffic,
@@ -102,8 +103,8 @@ class Service:
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
         self._arrived_ns = 0  # its arrival, for the latency figure
+        self._arrived_unix_ns = 0  # and for the log
         self._vehicle_ns = 0  # vehicle time of the newest state
-        self._log_failed = False
         self._last_beat: tuple[int, int] | None = None
 
     def stop(self) -> None:
@@ -216,7 +217,8 @@ class Service:
         }
         state = session.situation.state
         record = setpoint_record(vehicle.stamp_ns, state, output, sent=sent, messages=messages, timings_ms=timings_ms)
-        self._publisher.tick(record, state, vehicle, taken.frames, output, self._thinker.tracks)
+        arrived_ns, tracks = self._arrived_unix_ns, self._thinker.tracks
+        self._publisher.tick(record, state, vehicle, taken.frames, output, tracks, arrived_unix_ns=arrived_ns)
         self._services.note(vehicle, output)
         busy_ms = (stopwatch_ns() - started_ns) / 1e6
         self._meter.tick(timings_ms["total"], busy_ms, record.verdict)
@@ -246,15 +248,14 @@ class Service:
         self._services.poll()
         self._flush()
         self._publish_status(now_ns)
-        self._keep_log(now_ns)
+        self._keep_log()
 
-    def _keep_log(self, now_ns: int) -> None:
-        """Flush the log now and then; a log that cannot be written is told once and flown without."""
-        failure = self._publisher.keep_log(now_ns)
-        if failure is not None and not self._log_failed:
-            self._log_failed = True
-            log.error("%s", failure)
-            self._session.say(mav.SEVERITY_WARNING, "companion: log lost, flying on")
+    def _keep_log(self) -> None:
+        """Let the log be written; what goes wrong with it is told once and flown on without."""
+        trouble = self._publisher.keep_log()
+        if trouble is not None:
+            log.error("%s", trouble)
+            self._session.say(mav.SEVERITY_WARNING, "companion: log damaged, flying on")
 
     def _flush(self) -> int:
         """Send what the session has to say; the number of MAVLink packets."""
@@ -278,6 +279,7 @@ class Service:
         groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
         groups |= {"mavlink": self._codec.counts, "texts": self._session.text_counts}
         groups |= {"autopilot": self._session.watch.counts, "timesync": self._time.counts}
+        groups |= {"log": self._publisher.log_counts}
         return self._meter.counts(groups) | self._transport.all_counts()
 
     def _summary(self, recorder: Recorder | None) -> Summary:
@@ -312,7 +314,7 @@ class Service:
             return  # reordered or repeated by the link
         self._pending = vehicle
         self._vehicle_ns = vehicle.stamp_ns
-        self._arrived_ns = stopwatch_ns()
+        self._arrived_ns, self._arrived_unix_ns = stopwatch_ns(), self._clock.unix_ns()
         self._barrier.pending()
         self._traffic.on_vehicle(vehicle)
         self._session.heard_vehicle(self._now_ns())

@@ -23,7 +23,7 @@ LAYERS = [
         "companion.config_traffic",
         "companion.config_types",
     },
-    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload"},
+    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload", "companion.tlog"},
     {
         "companion.tracking",
         "companion.safety",
@@ -36,6 +36,8 @@ LAYERS = [
     {"companion.journal_format"},
     {"companion.journal"},
     {"companion.state"},
+    {"companion.log_files"},
+    {"companion.log_writer"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
     {
         "companion.notices",

@@ -67,15 +67,17 @@ def test_a_killed_process_leaves_what_was_flushed(tmp_path: Path) -> None:
         assert child.stdout.readline() == b"written\n"
         child.kill()
     assert child.returncode == -signal.SIGKILL
-    assert ticks(path) == list(range(90))
+    assert ticks(path)[:90] == list(range(90))
 
 
-def test_a_log_not_flushed_is_on_disk_up_to_the_last_chunks(tmp_path: Path) -> None:
+def test_what_is_appended_after_a_kick_reaches_the_disk_by_itself(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "flight.mcap", Config())
     payload = b'{"tick": 1, "filler": "%s"}' % (b"x" * 1000)
     for stamp_ns in range(200):
         recorder.message(SETPOINT, stamp_ns, payload)
-    assert len(ticks(recorder.path)) > 100
+    recorder.kick()
+    while len(ticks(recorder.path)) < 200:  # the writer flushes once a second; the test's own time-out ends this
+        pass
     recorder.close()
     assert len(ticks(recorder.path)) == 200
 
