@@ -100,10 +100,11 @@ class Commanded:
         """Position and velocity at the instant of action of the setpoint for ``vehicle``."""
         return at_action(vehicle, self._commands, acts_after_ns(config))
 
-    def note(self, recorded: SetpointRecord, sent: bool, config: Config) -> None:
-        """What that tick commanded."""
+    def note(self, recorded: SetpointRecord, sent: bool, config: Config) -> Vec3:
+        """What that tick commanded [m/s^2]."""
         sent_a = frozen(recorded.u_safe if sent and recorded.u_safe is not None else (0.0, 0.0, 0.0))
         self._commands.append((recorded.stamp_ns + acts_after_ns(config), sent_a))
+        return sent_a
 
 
 def predicted_distance(predicted: FloatArray, at: tuple[Vec3, Vec3], u: Vec3, dt_s: float) -> FloatArray:
