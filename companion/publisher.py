@@ -16,6 +16,7 @@ from companion.metrics import TickMeter
 from companion.pilot import PilotOutput
 from companion.record import Recorder
 from companion.report import FlightHash, tracks_out, vehicle_out
+from companion.scene_log import SceneLog
 from companion.session import VehicleSession
 from companion.state import State
 from companion.tracking.agility import AGILE
@@ -29,8 +30,15 @@ STATUS_NS = NS_PER_S // 5
 class Publisher:
     """Publishes and logs; the record goes out first, because in lockstep the simulator waits for it."""
 
-    def __init__(self, zenoh: ZenohLink, recorder: Recorder | None, journal: Journal | None = None) -> None:
+    def __init__(
+        self,
+        zenoh: ZenohLink,
+        recorder: Recorder | None,
+        scenes: SceneLog | None = None,
+        journal: Journal | None = None,
+    ) -> None:
         self._zenoh = zenoh
+        self._scenes = scenes
         self._recorder = recorder
         self._journal = journal
         if recorder is not None and journal is not None:
@@ -42,9 +50,9 @@ class Publisher:
         self._last: tuple[int, object] | None = None
 
     @property
-    def log_counts(self) -> Mapping[str, int]:
+    def log_counts(self) -> dict[str, int]:
         """Messages that did not get into the log; empty without one."""
-        return {} if self._recorder is None else self._recorder.counts
+        return {} if self._recorder is None else dict(self._recorder.counts)
 
     @property
     def log_hash(self) -> str:
@@ -59,6 +67,7 @@ class Publisher:
         output: PilotOutput | None,
         tracks: Callable[[], TrackTable],
         arrived_unix_ns: int | None = None,
+        target_enu: Vec3 | None = None,
     ) -> None:
         """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left.
 
@@ -77,6 +86,8 @@ class Publisher:
         self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle, arrived_unix_ns))
         if output is not None:
             self._offer("companion/tracks", vehicle.stamp_ns, lambda: tracks_out(output, table))
+        if self._scenes is not None:
+            self._scenes.tick(record, vehicle, output, table, target_enu)
         self._hash.tick(state, vehicle, frames, output, table)
 
     def _offer(self, key: str, stamp_ns: int, build: Callable[[], msgspec.Struct]) -> None:
@@ -94,6 +105,8 @@ class Publisher:
         """The profile is settled, or live parameters changed: the log says what holds from here on."""
         if self._recorder is not None:
             self._recorder.config(config, stamp_ns)
+        if self._scenes is not None:
+            self._scenes.configured(config)
 
     def keep_log(self) -> str | None:
         """The tick is over: let the log be written. What has befallen it since the last call, or None."""

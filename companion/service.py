@@ -36,6 +36,7 @@ from companion.publisher import Publisher
 from companion.record import Recorder
 from companion.report import setpoint_record
 from companion.route import Route
+from companion.scene_log import SceneLog
 from companion.session import VehicleSession
 from companion.state import FLYING
 from companion.thinker import Thinker
@@ -122,20 +123,28 @@ class Service:
         config = self._config
         loop = asyncio.get_running_loop()
         async with contextlib.AsyncExitStack() as stack:
-            recorder = None
-            if config.log.directory is not None:
-                recorder = Recorder(Path(config.log.directory) / "flight.mcap", config)
-                stack.callback(recorder.close)
+            recorder, scenes = self._open_log(stack)
             await self._transport.open()
             stack.push_async_callback(self._transport.close)
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
-            self._publisher = Publisher(zenoh, recorder, self._journal)
+            self._publisher = Publisher(zenoh, recorder, scenes, self._journal)
             gc.collect()
             gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
+
+    def _open_log(self, stack: contextlib.AsyncExitStack) -> tuple[Recorder | None, SceneLog | None]:
+        """The log, where one is wanted, and who draws for it; it hears of packets and texts from now on."""
+        config = self._config
+        if config.log.directory is None:
+            return None, None
+        recorder = Recorder(Path(config.log.directory) / "flight.mcap", config, self._clock)
+        stack.callback(recorder.close)
+        self._transport.on_packet = recorder.packet if config.log.tlog else None
+        self._session.on_text = lambda severity, text: recorder.text(self._vehicle_ns, severity, text)
+        return recorder, SceneLog(recorder, config, lambda: self._traffic.origin) if config.log.scene_hz > 0.0 else None
 
     async def _until_stopped(self) -> None:
         try:
@@ -217,8 +226,16 @@ class Service:
         }
         state = session.situation.state
         record = setpoint_record(vehicle.stamp_ns, state, output, sent=sent, messages=messages, timings_ms=timings_ms)
-        arrived_ns, tracks = self._arrived_unix_ns, self._thinker.tracks
-        self._publisher.tick(record, state, vehicle, taken.frames, output, tracks, arrived_unix_ns=arrived_ns)
+        self._publisher.tick(
+            record,
+            state,
+            vehicle,
+            taken.frames,
+            output,
+            self._thinker.tracks,
+            arrived_unix_ns=self._arrived_unix_ns,
+            target_enu=self._route.current,
+        )
         self._services.note(vehicle, output)
         busy_ms = (stopwatch_ns() - started_ns) / 1e6
         self._meter.tick(timings_ms["total"], busy_ms, record.verdict)

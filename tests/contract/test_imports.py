@@ -36,9 +36,11 @@ LAYERS = [
     {"companion.journal_format"},
     {"companion.journal"},
     {"companion.state"},
-    {"companion.log_files"},
+    {"companion.log_files", "companion.foxglove", "companion.provenance"},
     {"companion.log_writer"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
+    {"companion.scene"},
+    {"companion.scene_log"},
     {
         "companion.notices",
         "companion.confirm",
