@@ -11,12 +11,13 @@ import math
 import numpy as np
 from msgspec import Struct
 
+from companion.explain.cost import Cost, estimate
 from companion.explain.moment import Moment, Outline
+from companion.explain.refusal import Refusal, refusals
 from companion.link.wire import MarginOut, RowOut, TrackOut
 from companion.replay.whatif import predicted_distance
 from companion.types import FloatArray, Vec3, frozen
 
-ACTIVE_M_S2 = 0.05  # a row with less slack binds, as in the record
 LIMIT_M_S2 = 1e-3  # an acceleration this near to a bound is at it
 NEAR_TARGET_M = 0.3
 
@@ -50,9 +51,13 @@ class ObstacleFacts(Struct, frozen=True, kw_only=True):
 
 
 class RowFacts(Struct, frozen=True, kw_only=True):
-    """A row that shaped the answer."""
+    """An obstacle that refused the reference, and its tightest row at the answer."""
 
     track: str
+    shortfall_m_s2: float  # how far the reference breaks its tightest row
+    by_braking: bool  # because the vehicle could no longer stop before it
+    broken: bool  # the answer breaks its rows, too
+    inside_m: float  # how far the answer comes inside the distance kept, predicted over the horizon
     step: int  # -1: the braking distance
     step_s: float  # of the row's last instant, after the setpoint acts
     slack_m_s2: float
@@ -71,15 +76,6 @@ class LimitFacts(Struct, frozen=True, kw_only=True):
     bound: str
 
 
-class Cost(Struct, frozen=True, kw_only=True):
-    """What the change cost."""
-
-    ahead_m_s2: float  # acceleration towards the target given up, < 0: gained
-    began_ns: int | None  # of the run of changed ticks about this one
-    ended_ns: int | None
-    lost_s: float | None  # of that run: its duration less what the way covered takes at the speed towards the target
-
-
 class Facts(Struct, frozen=True, kw_only=True):
     """One tick."""
 
@@ -93,11 +89,14 @@ class Facts(Struct, frozen=True, kw_only=True):
     speed_m_s: float
     target: list[float] | None
     target_m: float | None
+    v_ahead_m_s: float
     wanted: Split | None
     did: Split | None
     change: Split | None  # did less wanted
     turned_deg: float | None  # angle between the two
     detour: bool
+    worst: str | None  # the row with the least room, of an obstacle or a limit
+    worst_slack_m_s2: float | None
     rows: list[RowFacts]
     obstacles: list[ObstacleFacts]  # of ``rows`` first, then the nearest
     limits: list[LimitFacts]
@@ -117,7 +116,7 @@ def facts(moment: Moment, ticks: list[Outline], run: tuple[int, int] | None) -> 
     u_safe = None if record.u_safe is None else frozen(record.u_safe)
     both = u_ref is not None and u_safe is not None
     change = u_safe - u_ref if u_ref is not None and u_safe is not None else None
-    rows = [_row(row, moment) for row in _active(record.rows) if row.margin is not None]
+    rows = [] if record.verdict == "nominal" else _rows(moment)
     return Facts(
         stamp_ns=record.stamp_ns,
         state=record.state,
@@ -129,11 +128,14 @@ def facts(moment: Moment, ticks: list[Outline], run: tuple[int, int] | None) -> 
         speed_m_s=math.hypot(*vehicle.v_enu.tolist()),
         target=None if target is None else target.tolist(),
         target_m=None if target is None else math.dist(vehicle.p_enu, target),
+        v_ahead_m_s=float(vehicle.v_enu @ ahead),
         wanted=None if u_ref is None else split(u_ref, ahead),
         did=None if u_safe is None else split(u_safe, ahead),
         change=None if change is None else split(change, ahead),
         turned_deg=_angle_deg(u_ref, u_safe) if both and u_ref is not None and u_safe is not None else None,
         detour=moment.detour,
+        worst=None if record.worst is None else record.worst.track,
+        worst_slack_m_s2=None if record.worst is None else record.worst.slack,
         rows=rows,
         obstacles=_obstacles(moment, [row.track for row in rows], ahead, u_ref, u_safe),
         limits=_limits(moment, u_safe),
@@ -141,7 +143,7 @@ def facts(moment: Moment, ticks: list[Outline], run: tuple[int, int] | None) -> 
         delay_s=config.delay.loop_s + config.actuation_s,
         sources_s={name: (record.stamp_ns - ns) / 1e9 for name, ns in sorted(moment.sightings.sources.items())},
         disturbance_m_s2=math.hypot(*record.disturbance),
-        cost=_cost(ticks, run, 0.0 if change is None else -float(change @ ahead)),
+        cost=estimate(ticks, run, 0.0 if change is None else -float(change @ ahead)),
     )
 
 
@@ -170,22 +172,26 @@ def _reason(moment: Moment) -> str:
     return status.reason if status is not None and status.state == moment.record.state else ""
 
 
-def _active(rows: list[RowOut]) -> list[RowOut]:
-    """Rows of obstacles that bind, the tightest first, one of each obstacle."""
-    seen: set[str] = set()
+def _rows(moment: Moment) -> list[RowFacts]:
+    """Of the obstacles that refused the reference, and of those whose rows the answer breaks, the hardest first."""
     found = []
-    for row in sorted(rows, key=lambda row: row.slack):
-        if row.slack < ACTIVE_M_S2 and row.margin is not None and row.track not in seen:
-            seen.add(row.track)
-            found.append(row)
+    for refusal in refusals(moment):
+        rows = [row for row in moment.record.rows if row.track == refusal.track and row.margin is not None]
+        rows.sort(key=lambda row: (row.step < 0) != refusal.by_braking)
+        if rows and (refusal.refused or refusal.broken):
+            found.append(_row(rows[0], refusal, moment))
     return found
 
 
-def _row(row: RowOut, moment: Moment) -> RowFacts:
+def _row(row: RowOut, refusal: Refusal, moment: Moment) -> RowFacts:
     safety, margin = moment.config.safety, row.margin
     assert margin is not None
     return RowFacts(
         track=row.track,
+        shortfall_m_s2=refusal.shortfall_m_s2,
+        by_braking=refusal.by_braking,
+        broken=refusal.broken,
+        inside_m=refusal.inside_m,
         step=row.step,
         step_s=0.0 if row.step < 0 else (row.step + 2) * safety.dt_s,
         slack_m_s2=row.slack,
@@ -193,7 +199,7 @@ def _row(row: RowOut, moment: Moment) -> RowFacts:
         margin=margin,
         epsilon=row.epsilon,
         epsilon_star=row.epsilon_star,
-        decay_share=safety.alpha2 * row.epsilon,
+        decay_share=min(safety.alpha2 * row.epsilon, 1.0),
     )
 
 
@@ -284,40 +290,3 @@ def _limits(moment: Moment, u_safe: Vec3 | None) -> list[LimitFacts]:
         if room < LIMIT_M_S2:
             found.append(LimitFacts(name="slew", slack_m_s2=room, bound=f"{limits.slew_m_s3:g} m/s^3 of each axis"))
     return found
-
-
-def _cost(ticks: list[Outline], run: tuple[int, int] | None, ahead_m_s2: float) -> Cost:
-    if run is None:
-        return Cost(ahead_m_s2=ahead_m_s2, began_ns=None, ended_ns=None, lost_s=None)
-    first, last = ticks[run[0]], ticks[run[1]]
-    return Cost(ahead_m_s2=ahead_m_s2, began_ns=first.stamp_ns, ended_ns=last.stamp_ns, lost_s=_lost_s(ticks, run))
-
-
-def _lost_s(ticks: list[Outline], run: tuple[int, int]) -> float | None:
-    """Duration of the run less the time that the way covered towards the target takes at the speed before or after.
-
-    That speed is the greater of the two, each over the tenth of a second outside the run. None without a target, or
-    where neither moved towards it.
-    """
-    first, last = run
-    began, ended = ticks[first].distance_m, ticks[last].distance_m
-    if began is None or ended is None or ticks[first].target != ticks[last].target:
-        return None
-    speed = max(_approach_m_s(ticks, first, -1), _approach_m_s(ticks, last, 1))
-    if speed < 0.3:
-        return None
-    duration_s = (ticks[last].stamp_ns - ticks[first].stamp_ns) / 1e9
-    return max(0.0, duration_s - (began - ended) / speed)
-
-
-def _approach_m_s(ticks: list[Outline], number: int, way: int) -> float:
-    """Speed towards the target over the tenth of a second from ``number`` on, backwards (-1) or forwards (1)."""
-    other = number
-    while 0 <= other + way < len(ticks) and abs(ticks[other].stamp_ns - ticks[number].stamp_ns) < 100_000_000:
-        other += way
-    one, two = sorted((number, other))
-    elapsed_s = (ticks[two].stamp_ns - ticks[one].stamp_ns) / 1e9
-    start, end = ticks[one].distance_m, ticks[two].distance_m
-    if elapsed_s <= 0.0 or start is None or end is None or ticks[one].target != ticks[two].target:
-        return 0.0
-    return (start - end) / elapsed_s

@@ -15,11 +15,14 @@ _VERDICTS = {
     "braking": "no solver had a usable answer: braking in the safest direction",
     "silent": "the brain gave no answer",
 }
+_CHANGED = ("adjusted", "relaxed", "braking")
+MOST = 3  # obstacles told in full
 _TASKS = {
     "fly": "fly to the target",
     "hold": "brake and hold",
     "stay": "hold where it is, nothing engaged",
 }
+_AIMS = {"fly": "the way to the target", "hold": "holding", "stay": "staying"}
 _LIMITS = {
     "box": "acceleration",
     "slew": "change of the acceleration",
@@ -34,20 +37,21 @@ _LIMITS = {
 
 def paragraphs(facts: Facts, origin_ns: int) -> list[tuple[str, str]]:
     """(heading, text) in the order in which a pilot asks."""
-    told = [("State", _state(facts, origin_ns)), ("Wanted", _wanted(facts)), ("Did", _did(facts))]
+    told = [("State", _state(facts, origin_ns)), ("In short", _short(facts))]
+    told += [("Wanted", _wanted(facts)), ("Did", _did(facts))]
     by_name = {one.track: one for one in facts.obstacles}
-    for number, row in enumerate(facts.rows):
+    for number, row in enumerate(facts.rows[:MOST]):
         obstacle = by_name.get(row.track)
         if obstacle is not None:
-            told.append(("Because" if number == 0 else "and", _obstacle(obstacle, facts)))
-            told.append(("Margin", _margin(row)))
-            told.append(("Rule", _rule(row)))
-    rest = [one for one in facts.obstacles if one.track not in {row.track for row in facts.rows}]
+            told.append(("Because" if number == 0 else "and", f"{_obstacle(obstacle, facts)} {_refusal(row)}"))
+            told += [("Margin", _margin(row)), ("Rule", _rule(row))]
+    if len(facts.rows) > MOST:
+        told.append(("and", f"{len(facts.rows) - MOST} more obstacles refused the reference, less hard."))
     if not facts.rows:
-        told.append(("Near", _obstacle(rest[0], facts) if rest else "No obstacle was tracked."))
+        told.append(("Nearest", _obstacle(facts.obstacles[0], facts) if facts.obstacles else "No obstacle is tracked."))
     told += [("Limits", _limits(facts.limits))] if facts.limits else []
     told.append(("Data", _data(facts, by_name)))
-    told += [("Cost", _cost(facts))] if facts.verdict in ("adjusted", "relaxed", "braking") else []
+    told += [("Cost", _cost(facts))] if facts.verdict in _CHANGED else []
     return [(heading, text) for heading, text in told if text]
 
 
@@ -61,7 +65,45 @@ def _state(facts: Facts, origin_ns: int) -> str:
     reason = f" ({facts.reason})" if facts.reason else ""
     sent = "" if facts.sent else " Nothing was sent to the autopilot."
     when = f"{moment_words(facts.stamp_ns, origin_ns)} (vehicle time {facts.stamp_ns / 1e9:.3f} s)"
-    return f"{when}: {facts.state}{reason}, {facts.verdict}: {_VERDICTS[facts.verdict]}.{sent}"
+    worst = ""
+    if facts.verdict in ("relaxed", "braking") and facts.worst is not None and facts.worst_slack_m_s2 is not None:
+        worst = f" Worst is {_LIMITS.get(facts.worst, facts.worst)}, {_slack(facts.worst_slack_m_s2)}."
+    return f"{when}: {facts.state}{reason}, {facts.verdict}: {_VERDICTS[facts.verdict]}.{worst}{sent}"
+
+
+def _short(facts: Facts) -> str:
+    """One sentence for who reads no further."""
+    if facts.change is None:
+        return "Without an answer nothing was flown."
+    if facts.verdict == "nominal":
+        return f"Nothing stood against {_AIMS[facts.task]}."
+    doing = _doing(facts.change, facts.v_ahead_m_s)
+    if not facts.rows:
+        why = ", ".join(_LIMITS.get(one.name, one.name) for one in facts.limits)
+        what = "To get round what held it up" if facts.detour else f"For the sake of its limits ({why})" if why else ""
+        return f"{what or 'Of two ways that cost about the same it stayed on one'}, it {doing}."
+    names = [row.track for row in facts.rows]
+    who = ", ".join(names[:MOST]) + (f" and {len(names) - MOST} more" if len(names) > MOST else "")
+    first = next((one for one in facts.obstacles if one.track == names[0]), None)
+    if first is None or first.miss_reference_m is None or first.miss_answer_m is None:
+        return f"For {who} it {doing}."
+    gap = _pass(first.miss_reference_m)
+    gain = first.miss_answer_m - first.miss_reference_m
+    better = f", {gain:.2f} m less than the answer does" if gain > 0.01 else ""
+    return f"For {who} it {doing}: the reference would have led to {gap} within {facts.horizon_s:.1f} s{better}."
+
+
+def _doing(change: Split, v_ahead: float) -> str:
+    """What a change of the acceleration amounts to, the largest part first."""
+    along = "sped up" if change.ahead > 0.0 else "slowed down" if v_ahead > 0.2 else "held back"
+    named = (
+        (abs(change.ahead), along),
+        (abs(change.left), f"went {'left' if change.left > 0.0 else 'right'}"),
+        (abs(change.up), "climbed" if change.up > 0.0 else "went down"),
+    )
+    big = sorted((part for part in named if part[0] >= max(SMALL, 0.3 * change.norm)), reverse=True)
+    words = [word for _, word in big] or ["changed next to nothing"]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _wanted(facts: Facts) -> str:
@@ -90,20 +132,29 @@ def _did(facts: Facts) -> str:
 
 
 def _obstacle(one: ObstacleFacts, facts: Facts) -> str:
-    motion = (
-        f"closing at {one.closing_m_s:.1f} m/s" if one.closing_m_s > 0 else f"opening at {-one.closing_m_s:.1f} m/s"
-    )
+    motion = "keeping its distance"
+    if abs(one.closing_m_s) >= 0.05:
+        motion = f"{'closing' if one.closing_m_s > 0 else 'moving away'} at {abs(one.closing_m_s):.1f} m/s"
     text = f"{one.track}, {_gap(one.distance_m)} {_where(one.bearing)}, {motion}"
-    if one.cpa_s is not None and one.cpa_m is not None:
+    if one.cpa_s is not None and one.cpa_m is not None and one.cpa_s >= 0.05:
         text += f"; if both flew straight on, {_pass(one.cpa_m)} in {one.cpa_s:.1f} s"
     text += "."
-    if one.miss_reference_m is not None and one.miss_answer_m is not None:
-        ahead = f" Predicted over the next {facts.horizon_s:.1f} s: "
-        if abs(one.miss_reference_m - one.miss_answer_m) < 0.005:
-            return text + ahead + f"{_pass(one.miss_answer_m)} in {one.miss_answer_s:.1f} s."
-        with_reference = f"with the reference {_pass(one.miss_reference_m)} in {one.miss_reference_s:.1f} s"
-        text += ahead + f"{with_reference}, with the answer {_pass(one.miss_answer_m)} in {one.miss_answer_s:.1f} s."
-    return text
+    if one.miss_reference_m is None or one.miss_answer_m is None:
+        return text
+    text += f" Predicted over the next {facts.horizon_s:.1f} s: "
+    answer = f"{_pass(one.miss_answer_m)} {_in(one.miss_answer_s)}"
+    if abs(one.miss_reference_m - one.miss_answer_m) < 0.005:
+        return f"{text}{answer}."
+    reference = f"{_pass(one.miss_reference_m)} {_in(one.miss_reference_s)}"
+    return f"{text}with the reference {reference}, with the answer {answer}."
+
+
+def _refusal(row: RowFacts) -> str:
+    """How hard the reference was refused."""
+    if row.shortfall_m_s2 <= 0.0:
+        return "It admits the reference, not the answer."
+    why = "could not have stopped before it" if row.by_braking else "would have come nearer, or faster, than is allowed"
+    return f"With the reference it {why}: {row.shortfall_m_s2:.2f} m/s^2 too much."
 
 
 def _margin(row: RowFacts) -> str:
@@ -118,60 +169,65 @@ def _margin(row: RowFacts) -> str:
 
 
 def _rule(row: RowFacts) -> str:
-    where = (
-        "the braking distance binds"
-        if row.step < 0
-        else f"step {row.step} of the horizon binds, {row.step_s:.2f} s ahead"
+    where = f"step {row.step} of the horizon, {row.step_s:.2f} s ahead"
+    if row.step < 0:
+        return f"The braking distance decides; {_slack(row.slack_m_s2)}."
+    if row.broken:
+        depth = f"comes {row.inside_m:.2f} m inside that distance" if row.inside_m > 0.005 else "keeps that distance"
+        tightest = f"its tightest row is {where}: {_slack(row.slack_m_s2)}"
+        return f"No allowed answer was left. The one flown {depth}; {tightest}."
+    share = f"up to {100.0 * row.decay_share:.0f} % of the room left may be used up per step"
+    star = (
+        "approaching, so epsilon* is 0" if row.epsilon_star == 0.0 else f"separating, epsilon* {row.epsilon_star:.2f}"
     )
-    short = "holds exactly" if abs(row.slack_m_s2) < 1e-3 else f"has {row.slack_m_s2:.2f} m/s^2 to spare"
-    if row.slack_m_s2 < -1e-3:
-        short = f"is broken by {-row.slack_m_s2:.2f} m/s^2"
-    share = (
-        f"epsilon {row.epsilon:.2f} lets the vehicle use up {100.0 * min(row.decay_share, 1.0):.0f} % of the room left"
-    )
-    star = "0 as for all that approaches" if row.epsilon_star == 0.0 else f"{row.epsilon_star:.2f} as it separates"
-    return f"{_cap(where)} and {short}; {share} per step (aim: epsilon* {star})."
+    return f"Decided by {where}: {_slack(row.slack_m_s2)}; {share} (epsilon {row.epsilon:.2f}; {star})."
+
+
+def _slack(slack_m_s2: float) -> str:
+    if slack_m_s2 < -1e-3:
+        return f"short by {-slack_m_s2:.2f} m/s^2"
+    return "it just holds" if slack_m_s2 < 1e-3 else f"{slack_m_s2:.2f} m/s^2 to spare"
 
 
 def _limits(limits: list[LimitFacts]) -> str:
-    told = []
-    for one in limits:
-        state = "at it" if abs(one.slack_m_s2) < 1e-3 else f"{one.slack_m_s2:.2f} m/s^2 to spare"
-        if one.slack_m_s2 < -1e-3:
-            state = f"broken by {-one.slack_m_s2:.2f} m/s^2"
-        told.append(f"{_LIMITS.get(one.name, one.name)} ({one.bound}): {state}")
-    return _cap("; ".join(told)) + "."
+    told = [f"{_LIMITS.get(one.name, one.name)} ({one.bound}), {_slack(one.slack_m_s2)}" for one in limits]
+    return "At or near: " + "; ".join(told) + "."
 
 
 def _data(facts: Facts, by_name: dict[str, ObstacleFacts]) -> str:
     told = []
-    for name in [row.track for row in facts.rows] or list(by_name):
+    for name in [row.track for row in facts.rows[:MOST]] or list(by_name)[:1]:
         one = by_name.get(name)
         if one is not None:
-            age = "of unknown age" if one.age_s is None else f"last seen {one.age_s:.2f} s before"
-            text = f"{one.track} {age} by {', '.join(one.sources) or 'nobody'}, {one.status}"
-            told.append(text + (f", agile (predictions widen {one.growth:.1f} times)" if one.growth >= 2.0 else ""))
+            age = "was never seen under its name" if one.age_s is None else f"was last seen {one.age_s:.2f} s before"
+            by = f" by {', '.join(one.sources)}" if one.sources else ""
+            agile = f", turns more sharply than assumed: its uncertainty grows {one.growth:.1f} times as fast"
+            told.append(f"{one.track} {age}{by} ({one.status}{agile if one.growth >= 2.0 else ''})")
     if facts.sources_s:
-        told.append("newest frames: " + ", ".join(f"{name} {age:.2f} s old" for name, age in facts.sources_s.items()))
-    told.append(f"the setpoint acts {facts.delay_s:.2f} s later")
+        ages = ", ".join(f"{name} {age:.2f} s" for name, age in facts.sources_s.items())
+        told.append(f"age of the newest frames: {ages}")
+    told.append(f"the setpoint acts {facts.delay_s:.2f} s after the state it answers")
     if facts.disturbance_m_s2 > SMALL:
-        told.append(f"{facts.disturbance_m_s2:.2f} m/s^2 of disturbance (wind, hover thrust) are compensated")
-    return _cap("; ".join(told)) + "."
+        told.append(f"{facts.disturbance_m_s2:.2f} m/s^2 of wind or hover-thrust error are compensated on top")
+    return "; ".join(told) + "."
 
 
 def _cost(facts: Facts) -> str:
     cost = facts.cost
-    if abs(cost.ahead_m_s2) < SMALL:
-        now = "No acceleration towards the target given up at this tick."
-    elif cost.ahead_m_s2 > 0.0:
-        now = f"{cost.ahead_m_s2:.2f} m/s^2 towards the target given up at this tick."
-    else:
-        now = f"None at this tick: it accelerated {-cost.ahead_m_s2:.2f} m/s^2 more towards the target."
+    now = "No acceleration towards the target was given up at this tick."
+    if abs(cost.ahead_m_s2) >= SMALL:
+        verb = "given up" if cost.ahead_m_s2 > 0.0 else "gained"
+        now = f"{abs(cost.ahead_m_s2):.2f} m/s^2 towards the target {verb} at this tick."
     if cost.began_ns is None or cost.ended_ns is None:
         return now
     duration_s = (cost.ended_ns - cost.began_ns) / NS_PER_S
-    text = f"{now} Changed for {duration_s:.1f} s in a row"
-    return text + ("." if cost.lost_s is None else f", which took about {cost.lost_s:.1f} s longer than flying on.")
+    run = "It is the only changed answer"
+    if duration_s > 0.0:
+        run = f"It is part of {duration_s:.2f} s of changed answers"
+    if cost.behind_s is None or cost.behind_m is None or cost.slower_m_s is None:
+        return f"{now} {run}."
+    behind = f"about {cost.behind_s:.1f} s ({cost.behind_m:.1f} m) behind one that flew the reference"
+    return f"{now} {run}, at the end of which the vehicle is {behind}, and {cost.slower_m_s:.1f} m/s slower (estimate)."
 
 
 def _vector(v: Split) -> str:
@@ -185,7 +241,7 @@ def _parts(v: Split, norm: float) -> str:
     """Directions that make up most of a vector: "ahead", "ahead and left"."""
     named = (("ahead", "back", v.ahead), ("left", "right", v.left), ("up", "down", v.up))
     big = sorted(((abs(x), one if x > 0 else other) for one, other, x in named if abs(x) > 0.3 * norm), reverse=True)
-    return " and ".join(name for _, name in big)
+    return ", ".join(name for _, name in big)
 
 
 def _change(v: Split) -> str:
@@ -217,5 +273,5 @@ def _pass(metres: float) -> str:
     return f"{metres:.2f} m between them" if metres >= 0.0 else "contact"
 
 
-def _cap(text: str) -> str:
-    return text[:1].upper() + text[1:]
+def _in(seconds: float | None) -> str:
+    return "now" if not seconds else f"in {seconds:.1f} s"

@@ -11,7 +11,7 @@ import msgspec
 from companion.config import Config
 from companion.errors import ConfigError
 from companion.journal_format import Configure, Construct, Observe, Reset, Retune, Step, inputs_of
-from companion.pilot import Pilot, PilotInput, PilotOutput
+from companion.pilot import Pilot, PilotInput, PilotOutput, ReferenceLaw
 from companion.policy import Policy, load_policy
 from companion.replay.journal_reader import Entry, JournalReader
 from companion.types import NS_PER_S, TrackTable
@@ -38,14 +38,23 @@ class Player:
     Args:
         variant: what to fly in place of each configuration of the log; None: that itself.
         artifact: a policy to fly in place of the recorded one, which is then not compared.
+        law: a reference law in place of any policy.
     """
 
-    def __init__(self, reader: JournalReader, *, variant: Variant | None = None, artifact: str | None = None) -> None:
+    def __init__(
+        self,
+        reader: JournalReader,
+        *,
+        variant: Variant | None = None,
+        artifact: str | None = None,
+        law: ReferenceLaw | None = None,
+    ) -> None:
         self.reader = reader
         self.retunes: list[tuple[int, str]] = []  # (stamp, what happened) of every change of the configuration
         self.construct: Construct | None = None
         self._variant = variant
         self._artifact = artifact
+        self._law = law
         self._stamp_ns = 0
         self.logged_config = Config()  # what the log flew at the tick just played
 
@@ -62,7 +71,7 @@ class Player:
             if isinstance(call, Construct):
                 self.construct = call
                 config = self._config(call.config)
-                pilot = Pilot(config, self._policy(call, config))
+                pilot = Pilot(config, self._policy(call, config) if self._law is None else self._law)
                 continue
             assert pilot is not None  # the reader begins with `construct` or not at all
             if isinstance(call, Step):

@@ -102,6 +102,8 @@ class Commanded:
 
     def note(self, recorded: SetpointRecord, sent: bool, config: Config) -> Vec3:
         """What that tick commanded [m/s^2]."""
+        if self._commands and recorded.stamp_ns < self._commands[-1][0] - acts_after_ns(config):
+            self._commands.clear()  # the clock began anew
         sent_a = frozen(recorded.u_safe if sent and recorded.u_safe is not None else (0.0, 0.0, 0.0))
         self._commands.append((recorded.stamp_ns + acts_after_ns(config), sent_a))
         return sent_a

@@ -6,6 +6,8 @@ need, compressed. Five flights, about a minute.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import subprocess
 import sys
 import tempfile
@@ -16,7 +18,20 @@ import msgspec
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
 
+from companion.cli import main as main_of_companion
+
 HERE = Path(__file__).parent
+GOLDEN = HERE / "explained.txt"
+EXPLAINED = (
+    ("demo", "--at", "0.5"),
+    ("demo", "--worst", "--around", "0.1"),
+    ("demo", "--at", "4"),
+    ("demo", "--at", "-2"),
+    ("hold", "--at", "2"),
+    ("noisy", "--worst"),
+    ("ardupilot", "--at", "2"),
+    ("retune", "--worst"),
+)
 KEPT = {"brain", "setpoint", "tracks", "config", "status"}  # of /companion/..., beside the obstacles
 NOISY = """
 description = "noise, clutter and no names"
@@ -107,13 +122,25 @@ FLIGHTS: dict[str, tuple[Callable[[Path], Path], float]] = {
 
 
 def main() -> int:
-    for name in sys.argv[1:] or FLIGHTS:
+    for name in sys.argv[1:] or FLIGHTS:  # or only the explanations: none
+        if name == "none":
+            break
         fly, seconds = FLIGHTS[name]
         with tempfile.TemporaryDirectory() as folder:
             out = HERE / f"{name}.mcap"
             cut(fly(Path(folder)), out, seconds)
         print(f"{out.name}: {out.stat().st_size / 1000:.0f} kB", flush=True)
+    GOLDEN.write_text("\n".join(explained(words) for words in EXPLAINED), encoding="utf-8")
     return 0
+
+
+def explained(words: tuple[str, ...]) -> str:
+    """The command, and what it says: to be read before it is committed."""
+    log, *rest = words
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        main_of_companion(["explain", str(HERE / f"{log}.mcap"), *rest])
+    return f"$ companion explain {' '.join((f'{log}.mcap', *rest))}\n{out.getvalue()}"
 
 
 def cut(path: Path, out: Path, seconds: float) -> None:
