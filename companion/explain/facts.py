@@ -177,9 +177,8 @@ def _rows(moment: Moment) -> list[RowFacts]:
     found = []
     for refusal in refusals(moment):
         rows = [row for row in moment.record.rows if row.track == refusal.track and row.margin is not None]
-        rows.sort(key=lambda row: (row.step < 0) != refusal.by_braking)
         if rows and (refusal.refused or refusal.broken):
-            found.append(_row(rows[0], refusal, moment))
+            found.append(_row(min(rows, key=lambda row: row.slack), refusal, moment))
     return found
 
 
