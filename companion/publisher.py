@@ -8,7 +8,9 @@ from typing import Protocol
 
 import msgspec
 
+from companion import journal_format
 from companion.config import Config
+from companion.journal import Journal
 from companion.link import wire
 from companion.link.zenoh import ZenohLink
 from companion.metrics import TickMeter
@@ -39,11 +41,20 @@ class Watcher(Protocol):
 class Publisher:
     """Publishes and logs; the record goes out first, because in lockstep the simulator waits for it."""
 
-    def __init__(self, zenoh: ZenohLink, recorder: Recorder | None, scenes: SceneLog | None = None) -> None:
+    def __init__(
+        self,
+        zenoh: ZenohLink,
+        recorder: Recorder | None,
+        scenes: SceneLog | None = None,
+        journal: Journal | None = None,
+    ) -> None:
         self._zenoh = zenoh
         self._scenes = scenes
         self._recorder = recorder
         self.watcher: Watcher | None = None
+        self._journal = journal
+        if recorder is not None and journal is not None:
+            recorder.declare(journal_format.TOPIC, "BrainCall", journal_format.schema())
         self._hash = FlightHash()
         self._verdict = "silent"
         self.tracks = 0  # of the last tick
@@ -91,7 +102,8 @@ class Publisher:
         self.tracks = len(table)
         self.agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
         if self._recorder is not None:
-            self._recorder.frames(frames, vehicle.stamp_ns)
+            if self._journal is not None:
+                self._journal.write(self._recorder, frames)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
         self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle, arrived_unix_ns))
         if output is not None:
@@ -124,6 +136,8 @@ class Publisher:
         """The tick is over: let the log be written. What has befallen it since the last call, or None."""
         if self._recorder is None:
             return None
+        if self._journal is not None:
+            self._journal.write(self._recorder)
         self._recorder.kick()
         return self._recorder.trouble()
 

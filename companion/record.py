@@ -26,7 +26,6 @@ from companion.log_files import Limits, LogFiles
 from companion.log_writer import LogWriter
 from companion.provenance import Provenance, provenance
 from companion.tlog import is_secret
-from companion.types import DetectionFrame
 
 CONFIG, METADATA, OBSTACLES = "/companion/config", "/companion/metadata", "/companion/input/obstacles"
 TEXTS = "/companion/texts"
@@ -129,11 +128,6 @@ class Recorder:
         payload = _ENCODER.encode(head)
         self._writer.put(lambda files: files.standing(CONFIG, stamp_ns, payload), len(payload))
 
-    def frames(self, frames: tuple[DetectionFrame, ...], tick_ns: int) -> None:
-        """Append the obstacle frames that a tick consumed."""
-        for frame in frames:
-            self._writer.put(partial(_add_frame, frame=frame, tick_ns=tick_ns), 200 * len(frame.detections))
-
     def packet(self, raw: bytes, unix_us: int, outgoing: bool) -> None:
         """Append one MAVLink packet, as it was on the wire, to the tlog."""
         if not is_secret(raw):
@@ -179,35 +173,3 @@ def _add_provenance(files: LogFiles, *, config: Config, unix_ns: int) -> None:
 def _add_all(files: LogFiles, messages: Iterable[Message]) -> None:
     for topic, stamp_ns, payload in messages:
         files.add(topic, stamp_ns, payload)
-
-
-def _add_frame(files: LogFiles, *, frame: DetectionFrame, tick_ns: int) -> None:
-    files.add(OBSTACLES, tick_ns, _ENCODER.encode(_frame_json(frame)))
-
-
-def _frame_json(frame: DetectionFrame) -> dict[str, Any]:
-    return {
-        "stamp_ns": frame.stamp_ns,
-        "clock": "vehicle",
-        "frame": "local_enu",
-        "source": frame.source,
-        "sequence": frame.sequence,
-        "kind": frame.kind.value,
-        "arrived_unix_ns": frame.arrived_unix_ns,
-        "obstacles": [
-            {
-                "id": seen.id,
-                "position": seen.p_enu.tolist(),
-                "radius": seen.radius_m,
-                "position_std": seen.p_std_m,
-                "velocity": None if seen.v_enu is None else seen.v_enu.tolist(),
-                "velocity_std": seen.v_std_m_s,
-                "covariance": None if seen.covariance is None else _upper(seen.covariance.tolist()),
-            }
-            for seen in frame.detections
-        ],
-    }
-
-
-def _upper(matrix: list[list[float]]) -> list[float]:
-    return [value for i, row in enumerate(matrix) for value in row[i:]]

@@ -16,6 +16,7 @@ from companion.clock import Clock, stopwatch_ns
 from companion.config import Config
 from companion.doors import Doors
 from companion.errors import CompanionError
+from companion.journal import Journal
 from companion.link import mav
 from companion.link.events import Event, TimesyncReply, TimesyncRequest
 from companion.link.inbox import ObstacleInbox
@@ -83,7 +84,9 @@ class Service:
         )
         self._session.origin = lambda: self._traffic.origin
         self._barrier = LockstepBarrier(config, self._inbox, clock)
-        self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
+        pilot = Pilot(config) if pilot is None else pilot
+        self._journal = None if config.log.directory is None else Journal(pilot, config, artifact=pilot.artifact)
+        self._thinker = Thinker(config, self._journal or pilot, self._inbox, self._session)
         self._time = TimeBase(clock, self._codec, self._transport.send, self._on_restart, runs=not self._lockstep)
         self._time.on_step = self._session.watch.unix_stepped
         self._meter = TickMeter(1.0 / config.rate_hz)
@@ -132,7 +135,7 @@ class Service:
             stack.push_async_callback(self._transport.close)
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
-            self._publisher = Publisher(zenoh, recorder, scenes)
+            self._publisher = Publisher(zenoh, recorder, scenes, self._journal)
             if config.http.enabled:
                 await self._serve_http(stack)
             gc.collect()

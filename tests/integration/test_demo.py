@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from companion.cli import main
+
 pytestmark = pytest.mark.integration
 
 
@@ -41,6 +43,7 @@ def test_same_seed_same_flight_to_the_bit(tmp_path: Path) -> None:
     assert status == 0
     assert other["log_hash"] != first["log_hash"]
     _check_log(Path(first["log"]), first)
+    assert main(["replay", first["log"]]) == 0  # this process answers as the daemon did, to the bit
     assert (tmp_path / "a" / "flight.png").read_bytes()[:4] == b"\x89PNG"
 
 
