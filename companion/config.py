@@ -17,6 +17,7 @@ from msgspec import Meta
 
 from companion.config_check import check_arena, check_confirmation, check_reserve, check_ros2, check_tick, pointed
 from companion.config_links import MavlinkConfig, Ros2Config, ZenohConfig
+from companion.config_realtime import RealtimeConfig
 from companion.config_traffic import UNTRUSTED, TrafficConfig, check_traffic
 from companion.config_types import Acceleration, Name, NonNegative, Point, Positive, Section, SourceName, Stay
 from companion.errors import ConfigError
@@ -174,6 +175,7 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     disturbance: DisturbanceConfig = DisturbanceConfig()
     log: LogConfig = LogConfig()
     params: ParamsConfig = ParamsConfig()
+    realtime: RealtimeConfig = RealtimeConfig()
 
     @property
     def profile(self) -> Profile:
@@ -315,8 +317,8 @@ def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str
 
 
 def config_hash(config: Config) -> str:
-    """SHA-256 of the resolved configuration; where files lie is left out (it does not change the flight)."""
+    """SHA-256 of the resolved configuration; what does not change the flight is left out: where files lie, [realtime]."""
     values = msgspec.to_builtins(config)
-    values.pop("log")
-    values.pop("params")
+    for section in ("log", "params", "realtime"):
+        values.pop(section)
     return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()

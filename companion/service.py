@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import logging
 from pathlib import Path
 
+from companion import realtime
 from companion.clock import Clock, stopwatch_ns
 from companion.config import Config
 from companion.doors import Doors
@@ -95,6 +95,7 @@ class Service:
         self._services = Microservices(
             base, config, self._codec, self._session, clock, send=self._transport.send, retune=self._retune
         )
+        self._garbage = realtime.Collector()
         self._wake = asyncio.Event()
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
@@ -122,13 +123,14 @@ class Service:
             if config.log.directory is not None:
                 recorder = Recorder(Path(config.log.directory) / "flight.mcap", config)
                 stack.callback(recorder.close)
+            realtime.apply(config.realtime, log.warning)  # behind the recorder, before the links' threads
             await self._transport.open()
             stack.push_async_callback(self._transport.close)
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
             self._publisher = Publisher(zenoh, recorder)
-            gc.collect()
-            gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
+            self._garbage.take_over(realtime.load_seldom(wait=config.safety.solver == "osqp"))
+            stack.callback(self._garbage.hand_back)
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
@@ -175,6 +177,8 @@ class Service:
                 self._thinker.observe_ahead(self._vehicle_ns, self._now_ns())
                 self._barrier.check_simulator(self._vehicle_ns)
             self._housekeeping()
+            if self._pending is None:
+                self._garbage.idle(self._arrived_ns + NS_PER_S // self._config.rate_hz)
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
             ):
