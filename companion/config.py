@@ -317,7 +317,7 @@ def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str
 
 
 def config_hash(config: Config) -> str:
-    """SHA-256 of the resolved configuration; what does not change the flight is left out: where files lie, [realtime]."""
+    """SHA-256 of the resolved configuration without what does not change the flight: where files lie, [realtime]."""
     values = msgspec.to_builtins(config)
     for section in ("log", "params", "realtime"):
         values.pop(section)
