@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from companion import __version__
+from companion import __version__, realtime
 from companion.errors import CompanionError, ConfigError
 from companion.logging_setup import LEVELS, set_up_logging
 
@@ -72,8 +72,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # small matrices: threads only add latency
-        os.environ.setdefault(name, "1")
+    realtime.single_threads()  # before anything imports numpy
     arguments = build_parser().parse_args(argv)
     try:
         return int(arguments.handler(arguments))

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import logging
 from pathlib import Path
 
+from companion import realtime
 from companion.clock import Clock, stopwatch_ns
 from companion.config import Config
 from companion.doors import Doors
@@ -106,6 +106,7 @@ class Service:
         )
         parts = self._session, self._meter, self._inbox, self._transport
         self._vitals = Vitals(clock, notifier or Notifier(None), *parts, self._groups, lambda: self._vehicle_ns)
+        self._garbage = realtime.Collector()
         self._wake = asyncio.Event()
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
@@ -131,6 +132,7 @@ class Service:
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._vitals.close)
             recorder, scenes = self._open_log(stack)
+            realtime.apply(config.realtime, log.warning)  # behind the recorder, before the links' threads
             await self._transport.open()
             stack.push_async_callback(self._transport.close)
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
@@ -138,8 +140,8 @@ class Service:
             self._publisher = Publisher(zenoh, recorder, scenes, self._journal)
             if config.http.enabled:
                 await self._serve_http(stack)
-            gc.collect()
-            gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
+            self._garbage.take_over(realtime.load_seldom(wait=config.safety.solver == "osqp"))
+            stack.callback(self._garbage.hand_back)
             self._vitals.up(self._publisher)
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
@@ -215,6 +217,8 @@ class Service:
                 self._barrier.check_simulator(self._vehicle_ns)
             self._housekeeping()
             self._vitals.beat()
+            if self._pending is None:
+                self._garbage.idle(self._arrived_ns + NS_PER_S // self._config.rate_hz)
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
             ):
