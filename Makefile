@@ -16,7 +16,7 @@ SAFETY_TESTS := tests/unit/test_safety_*.py tests/property/test_safety_propertie
 PILOT_TESTS := tests/unit/test_pilot.py tests/unit/test_disturbance.py tests/unit/test_retune.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow coverage mutants logs check format images clean
+.PHONY: help demo docs test test-slow coverage mutants logs check format images clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' Makefile
@@ -64,6 +64,10 @@ check: $(VENV)/dev.stamp  ## lint, format check, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy -p tools
+
+docs: $(VENV)/dev.stamp  ## make the reference pages from the code
+	$(BIN)/python -m tools.docgen
 
 format: $(VENV)/dev.stamp  ## format the code
 	$(BIN)/ruff check --fix .

@@ -141,7 +141,7 @@ def from_float32(value: float) -> float:
 
 
 def reference() -> str:
-    """The table as Markdown, for docs/parameters.md."""
+    """The table as Markdown, for docs/reference/parameters.md."""
     default = Config()
     lines = [
         "| parameter | setting | range | default | units | meaning |",

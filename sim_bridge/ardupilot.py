@@ -1,9 +1,10 @@
 """ArduCopter as a pure state machine: no I/O, no clock; it is told the state and the time.
 
 Its modes, arming, takeoff, landing, failsafes and GUIDED as the real one (4.7-dev, SITL) was measured, and where that
-is silent as its source and parameter list say; docs/simulator.md tells which is which. The parts: `ardupilot_guided`
-(setpoints), `ardupilot_plans` (modes), `ardupilot_copter` (takeoff, landing), `ardupilot_follower` and `shaping` (how
-a plan is flown), `ardupilot_failsafe`, `ardupilot_parameters`. Here: what comes in, what may be done, what is told.
+is silent as its source and parameter list say; docs/explanation/simulator-ardupilot.md tells which is which. The
+parts: `ardupilot_guided` (setpoints), `ardupilot_plans` (modes), `ardupilot_copter` (takeoff, landing),
+`ardupilot_follower` and `shaping` (how a plan is flown), `ardupilot_failsafe`, `ardupilot_parameters`. Here: what
+comes in, what may be done, what is told.
 """
 
 from __future__ import annotations

@@ -89,14 +89,14 @@ class Vehicle(Table, frozen=True, kw_only=True):
     """One vehicle. Of several, the n-th is by default ``uav<n>`` with system id n."""
 
     name: Name = "uav1"  # its Zenoh prefix is uav/<name>
-    system_id: Annotated[int, Meta(ge=1, le=250)] = 1
-    personality: Literal["px4", "ardupilot"] = "px4"
+    system_id: Annotated[int, Meta(ge=1, le=250)] = 1  # MAVLink
+    personality: Literal["px4", "ardupilot"] = "px4"  # whose behaviour the autopilot has
     start: Point = (0.0, 0.0, 0.2)  # centre of the vehicle, local ENU [m]; 0.2 stands on the ground
     yaw_deg: Degrees = 0.0  # counter-clockwise from east
-    takeoff_altitude_m: Annotated[float, Meta(ge=0.5, le=80.0)] = 1.5
+    takeoff_altitude_m: Annotated[float, Meta(ge=0.5, le=80.0)] = 1.5  # above the start
     target: Point | None = None  # of this vehicle; None: that of [target]
     onboard_port: Port | None = None  # None: the command line's plus the vehicle's index
-    gcs_port: Port | None = None
+    gcs_port: Port | None = None  # the same, of the ground station
     parameters: dict[ParameterName, bool | int | float] = msgspec.field(default_factory=dict)  # the autopilot's
     daemon: dict[ConfigKey, ConfigScalar | list[ConfigScalar]] = msgspec.field(default_factory=dict)  # its `--set`
 
@@ -106,16 +106,16 @@ class Vehicle(Table, frozen=True, kw_only=True):
 
 
 class Target(Table, frozen=True, kw_only=True):
-    position: Point
+    position: Point  # ENU [m]
 
 
 class SensorSpec(Table, frozen=True, kw_only=True):
     """An external sensor; by default it sees every obstacle and, from each vehicle, the other vehicles."""
 
-    source: Name = "sim"
-    rate_hz: Annotated[float, Meta(gt=0.0, le=1000.0)] = 20.0
+    source: Name = "sim"  # its name in the Zenoh key
+    rate_hz: Annotated[float, Meta(gt=0.0, le=1000.0)] = 20.0  # frames a second
     sigma_m: NonNegative = 0.05  # of each axis
-    latency_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.05
+    latency_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.05  # from measurement to publication
     dropout: Probability = 0.05  # of one obstacle of one frame
     frame_dropout: Probability = 0.0  # of a whole frame
     range_m: Positive | None = None  # from the vehicle's centre; None: unlimited
@@ -123,7 +123,7 @@ class SensorSpec(Table, frozen=True, kw_only=True):
     fov_up_deg: Annotated[float, Meta(gt=0.0, le=180.0)] = 180.0  # full vertical angle about the body xy plane
     clutter: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0  # mean number of false detections a frame (Poisson)
     clutter_box: tuple[Point, Point] | None = None  # opposite corners, ENU; None: within the range and field of view
-    clutter_radius_m: Positive = 0.2
+    clutter_radius_m: Positive = 0.2  # of a false detection
     anonymous: bool = False  # detections without ids
     vehicles: tuple[Name, ...] | None = None  # names of those that carry it; None: all
 
@@ -131,9 +131,9 @@ class SensorSpec(Table, frozen=True, kw_only=True):
 class OperatorStep(Table, frozen=True, kw_only=True):
     """What the operator does, and when in lockstep: at a tick, or at the first tick at which a condition holds."""
 
-    do: Literal["arm", "takeoff", "engage", "release", "hold", "land", "disarm"]
-    at_tick: Tick | None = None
-    after: Literal["airborne_hover", "on_ground", "end"] | None = None
+    do: Literal["arm", "takeoff", "engage", "release", "hold", "land", "disarm"]  # the command
+    at_tick: Tick | None = None  # control period
+    after: Literal["airborne_hover", "on_ground", "end"] | None = None  # condition
     vehicle: Name | None = None  # None: every vehicle
 
 
@@ -141,12 +141,12 @@ class End(Table, frozen=True, kw_only=True):
     """The run ends when the target is reached (passed within ``reach_m``, then within ``hold_m`` for ``hold_s``),
     ``collision_s`` after a touch, or ``timeout_s`` after the vehicle entered offboard. ``stop`` false: never."""
 
-    reach_m: Positive = 0.1
-    hold_m: Positive = 0.3
-    hold_s: Positive = 3.0
-    timeout_s: Positive = 60.0
-    collision_s: NonNegative = 1.0
-    stop: bool = True
+    reach_m: Positive = 0.1  # passed within this
+    hold_m: Positive = 0.3  # then within this
+    hold_s: Positive = 3.0  # for this long
+    timeout_s: Positive = 60.0  # after the entry into external control
+    collision_s: NonNegative = 1.0  # after a touch
+    stop: bool = True  # false: fly on until a signal
 
 
 _STEPS = (
@@ -157,11 +157,11 @@ _STEPS = (
 
 
 class Scenario(Table, frozen=True, kw_only=True):
-    """A file. ``vehicle`` is always the first of ``fleet``, whichever form the file uses."""
+    """A file; without [[vehicles]] it flies the one of [vehicle]."""
 
-    description: str = ""
-    physics_hz: Annotated[int, Meta(ge=1, le=10_000)] = 240
-    control_hz: Annotated[int, Meta(ge=1, le=1000)] = 20
+    description: str = ""  # one line
+    physics_hz: Annotated[int, Meta(ge=1, le=10_000)] = 240  # physics steps a second
+    control_hz: Annotated[int, Meta(ge=1, le=1000)] = 20  # control periods a second
     vehicle: Vehicle = Vehicle()
     vehicles: tuple[Vehicle, ...] = ()
     target: Target | None = None

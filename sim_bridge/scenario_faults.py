@@ -68,43 +68,43 @@ _VALUES: dict[str, str] = {
 class FaultExpectation(Table, frozen=True, kw_only=True):
     """What is seen within ``within_s`` of the fault; several keys must all be seen, each at some instant."""
 
-    state: DaemonState | None = None
-    verdict: Verdict | None = None
-    mode: ModeName | None = None
-    text: Words | None = None
-    within_s: Positive = 2.0
+    state: DaemonState | None = None  # of the daemon
+    verdict: Verdict | None = None  # of the filter
+    mode: ModeName | None = None  # of the autopilot
+    text: Words | None = None  # part of a STATUSTEXT
+    within_s: Positive = 2.0  # of the fault
 
 
 class Fault(Table, frozen=True, kw_only=True):
     """One thing that goes wrong; see the module's head."""
 
-    what: What
-    on: Name
+    what: What  # goes wrong
+    on: Name  # link, source, daemon, autopilot or world
     at_s: Annotated[float, Meta(ge=0.0, le=1e4)] | None = None  # after the entry into external control
     at_tick: Tick | None = None  # or by the count of control periods
     for_s: Positive | None = None  # None: to the end
     vehicle: Name | None = None  # None: every vehicle
-    share: Probability = 1.0
-    value: float | Point | str | None = None
+    share: Probability = 1.0  # of the messages
+    value: float | Point | str | None = None  # of the fault, see below
     expect: FaultExpectation | None = None
 
 
 class Expectation(Table, frozen=True, kw_only=True):
     """What must hold for the whole flight, of every vehicle; None and () demand nothing."""
 
-    reached: bool | None = None
-    collided: bool | None = None
+    reached: bool | None = None  # the target
+    collided: bool | None = None  # with anything
     min_clearance_m: Annotated[float, Meta(ge=-10.0, le=1e3)] | None = None  # surface to surface, at least
     max_time_s: Positive | None = None  # to the target, at most
-    state_seen: tuple[DaemonState, ...] = ()
-    verdict_seen: tuple[Verdict, ...] = ()
-    mode_seen: tuple[ModeName, ...] = ()
-    text_seen: tuple[Words, ...] = ()
-    never_state: tuple[DaemonState, ...] = ()
-    final_state: DaemonState | None = None
-    final_mode: ModeName | None = None
-    landed: bool | None = None
-    disarmed: bool | None = None
+    state_seen: tuple[DaemonState, ...] = ()  # of the daemon, each at some instant
+    verdict_seen: tuple[Verdict, ...] = ()  # of the filter
+    mode_seen: tuple[ModeName, ...] = ()  # of the autopilot
+    text_seen: tuple[Words, ...] = ()  # parts of STATUSTEXTs
+    never_state: tuple[DaemonState, ...] = ()  # of the daemon
+    final_state: DaemonState | None = None  # of the daemon, at the end
+    final_mode: ModeName | None = None  # of the autopilot, at the end
+    landed: bool | None = None  # at the end
+    disarmed: bool | None = None  # at the end
 
 
 def fault_error(fault: Fault, *, sources: Collection[str], vehicles: Collection[str]) -> str | None:

@@ -31,10 +31,10 @@ class _Placed(Table, frozen=True, kw_only=True, tag_field="motion"):
     """What every obstacle states."""
 
     id: Name
-    radius_m: Positive = 0.2
-    origin: Point | None = None
-    cross_point: Point | None = None
-    cross_at_s: NonNegative | None = None
+    radius_m: Positive = 0.2  # of its sphere
+    origin: Point | None = None  # where its motion is placed, ENU [m]
+    cross_point: Point | None = None  # that it passes, ENU [m]
+    cross_at_s: NonNegative | None = None  # on the motions' clock
     start_s: NonNegative = 0.0  # it appears
     end_s: NonNegative | None = None  # it vanishes; None: never
     jitter: Jitter = Jitter()
@@ -57,21 +57,21 @@ class EightObstacle(_Placed, frozen=True, kw_only=True, tag="figure_eight"):
     """A lemniscate whose ``origin`` is its centre; ``cross_phase_deg`` is its phase at the crossing, 0 the centre."""
 
     size_m: Positive  # reach along its axis; half of it across
-    period_s: Positive
-    phase_deg: float | None = None
-    cross_phase_deg: float = 0.0
-    axis_yaw_deg: float = 90.0
-    tilt_deg: Tilt = 0.0
+    period_s: Positive  # of the whole figure
+    phase_deg: float | None = None  # at the start of the clock
+    cross_phase_deg: float = 0.0  # at the crossing
+    axis_yaw_deg: float = 90.0  # of its long axis, from east towards north
+    tilt_deg: Tilt = 0.0  # out of the horizontal, about the long axis
 
 
 class CircleObstacle(_Placed, frozen=True, kw_only=True, tag="circle"):
     """A circle whose ``origin`` is its centre; ``cross_phase_deg`` is its phase at the crossing."""
 
-    radius_path_m: Positive
-    period_s: Positive
+    radius_path_m: Positive  # of the circle
+    period_s: Positive  # of one round
     clockwise: bool = False  # seen from above, where it is flat
-    phase_deg: float | None = None
-    cross_phase_deg: float = 0.0
+    phase_deg: float | None = None  # at the start of the clock
+    cross_phase_deg: float = 0.0  # at the crossing
     axis_yaw_deg: float = 0.0  # of phase 0, from east towards north
     tilt_deg: Tilt = 0.0  # 90: upright
 
@@ -79,33 +79,33 @@ class CircleObstacle(_Placed, frozen=True, kw_only=True, tag="circle"):
 class WaypointsObstacle(_Placed, frozen=True, kw_only=True, tag="waypoints"):
     """Straight legs at constant speed. ``origin`` is added to the points and may be left out."""
 
-    points: Points
-    speed_m_s: Positive
+    points: Points  # ENU [m]
+    speed_m_s: Positive  # along the legs
     loop: bool = False  # from the last point back to the first, again and again; else it stays at the last
 
 
 class SplineObstacle(_Placed, frozen=True, kw_only=True, tag="spline"):
     """A cubic spline through points at their times; it rests before and after. ``origin`` as for waypoints."""
 
-    points: Points
-    times_s: Times
+    points: Points  # ENU [m]
+    times_s: Times  # one for each point, rising
 
 
 class TrackObstacle(_Placed, frozen=True, kw_only=True, tag="track"):
     """A recorded track: a CSV file with the header ``t_s,x,y,z``. ``origin`` as for waypoints."""
 
     file: Annotated[str, Meta(min_length=1, max_length=1000)]  # relative to the scenario's folder
-    interpolation: Literal["linear", "cubic"] = "linear"
+    interpolation: Literal["linear", "cubic"] = "linear"  # between the recorded points
 
 
 class PursuitObstacle(_Placed, frozen=True, kw_only=True, tag="pursuit"):
     """It starts at its origin at ``start_s`` and chases a vehicle."""
 
     of: Name | None = None  # the vehicle's name; None: the first
-    speed_m_s: Positive
-    accel_m_s2: Positive
+    speed_m_s: Positive  # at most
+    accel_m_s2: Positive  # at most
     velocity: Point = (0.0, 0.0, 0.0)  # at the start [m/s]
-    law: Literal["pure", "proportional"] = "pure"
+    law: Literal["pure", "proportional"] = "pure"  # pure: at the vehicle; proportional: navigation
     navigation: Annotated[float, Meta(gt=0.0, le=10.0)] = 3.0  # N of the proportional law
     until_s: NonNegative | None = None  # from then on it flies straight on; None: never
 

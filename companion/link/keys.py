@@ -1,4 +1,4 @@
-"""Every Zenoh key of the daemon with its quality of service, and the page that documents them (`docs/keys.md`)."""
+"""Every Zenoh key of the daemon with its quality of service, and their page (`docs/reference/keys.md`)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The ROS 2 door: obstacles of nodes that run rmw_zenoh, without ROS on this computer (docs/ros2.md).
+"""The ROS 2 door: obstacles of nodes that run rmw_zenoh, without ROS on this computer (docs/reference/ros2.md).
 
 rmw_zenoh publishes a topic on ``<domain>/<topic without outer slashes>/<pkg::msg::dds_::Type_>/<type hash>``: inner
 slashes stay (only its liveliness tokens turn them into ``%``), the payload is CDR behind a 4-byte header, an attachment
-has sequence number, time and publisher, of which nothing is needed here. Source: ros2/rmw_zenoh, docs/design.md.
+has sequence number, time and publisher, of which nothing is needed here. Source: ros2/rmw_zenoh, docs/reference/ros2.md.
 
 The door subscribes with ``*`` in the place of the hash, so that a message of another layout is seen and told, and
 decodes what has the hash of the layout it knows, one named in ``ros2.type_hashes``, or Humble's place holder.

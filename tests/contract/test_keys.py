@@ -1,4 +1,4 @@
-"""docs/keys.md is what the code prints, and what the code prints is what the daemon declares."""
+"""docs/reference/keys.md is what the code prints, and what the code prints is what the daemon declares."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from companion.cli import main
 from companion.link import keys, wire
 from companion.link.zenoh import ZenohHandlers, ZenohLink
 
-PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "keys.md"
 
 
 class Session:
@@ -68,7 +68,9 @@ def rows(heading: str) -> list[list[str]]:
 
 def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema", "--keys"]) == 0
-    assert capsys.readouterr().out == PAGE.read_text(encoding="utf-8"), "companion schema --keys > docs/keys.md"
+    assert capsys.readouterr().out == PAGE.read_text(encoding="utf-8"), (
+        "companion schema --keys > docs/reference/keys.md"
+    )
 
 
 @pytest.mark.parametrize("lockstep", [False, True])

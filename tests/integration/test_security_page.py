@@ -1,4 +1,4 @@
-"""docs/security.md: its commands run as printed, and what they make lets the right ones in."""
+"""docs/how-to/security.md: its commands run as printed, and what they make lets the right ones in."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sim_bridge.testing import free_port
 
 pytestmark = pytest.mark.integration
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "how-to" / "security.md").read_text(encoding="utf-8")
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl command")
 
 

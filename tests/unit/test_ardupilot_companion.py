@@ -2,7 +2,7 @@
 
 `vehicle.profile = "auto"`: the daemon finds out that this is ArduPilot, asks for streams, engages by command, flies,
 releases and brakes. PSC_JERK_XY is at its greatest, 20 m/s^3: under the default of 5 the reference policy circles its
-target (docs/simulator.md).
+target (docs/explanation/simulator-ardupilot.md).
 """
 
 from __future__ import annotations

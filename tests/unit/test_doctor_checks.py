@@ -373,5 +373,5 @@ def test_the_deadline_is_what_the_stopwatch_says() -> None:
 
 
 def test_the_documentation_names_every_parameter_that_is_read() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "doctor.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "how-to" / "check-before-flight.md").read_text(encoding="utf-8")
     assert [name for names in NAMES.values() for name in names if f"| {name} (" not in text] == []

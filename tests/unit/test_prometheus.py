@@ -22,7 +22,7 @@ from companion.sdnotify import Notifier
 from companion.service import Service
 from companion.state import Situation, State
 
-PAGE = Path(__file__).parents[2] / "docs" / "metrics.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "metrics.md"
 
 
 class Daemon:

@@ -381,7 +381,9 @@ def test_a_source_can_be_required_and_untrusted() -> None:
 
 
 def test_the_documentation_agrees_with_the_code() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "ros2.md").read_text(encoding="utf-8")
+    docs = Path(__file__).parents[2] / "docs"
+    pages = (docs / "tutorials" / "ros2.md", docs / "reference" / "ros2.md")
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
     config = parse_config(tomllib.loads(re.search(r"```toml\n(.*?)```", text, re.S)[1]))
     assert config.ros2.detections == ("/lidar/boxes",)
     assert config.obstacles.required == (source_name(config.ros2.detections[0]),)

@@ -1,4 +1,4 @@
-"""Step responses of attitude and acceleration within stated bands; docs/simulator.md prints the same figures.
+"""Step responses of attitude and acceleration within stated bands; docs/explanation/simulator-physics.md has them.
 
 Dead time: to 10 % of the step. Rise time: from 10 to 90 %. Settling: the last time outside 5 %. 1 kHz physics, so that
 times are exact to a millisecond; the vehicle flies at 240 Hz within 8 ms of the same (test_sim_controller.py).

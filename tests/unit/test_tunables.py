@@ -99,8 +99,8 @@ def test_a_float32_comes_back_as_the_decimal_that_was_typed() -> None:
 
 
 def test_the_page_is_the_table() -> None:
-    """docs/parameters.md is generated; it must not drift from the code."""
-    assert reference() in (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8")
+    """docs/reference/parameters.md is generated; it must not drift from the code."""
+    assert reference() in (ROOT / "docs" / "reference" / "parameters.md").read_text(encoding="utf-8")
 
 
 def test_the_largest_acceleration_is_one_that_can_be_sent() -> None:
