@@ -16,7 +16,7 @@ SAFETY_TESTS := tests/unit/test_safety_*.py tests/property/test_safety_propertie
 PILOT_TESTS := tests/unit/test_pilot.py tests/unit/test_disturbance.py tests/unit/test_retune.py
 
 .DEFAULT_GOAL := help
-.PHONY: docs help demo test test-slow coverage mutants check format images clean
+.PHONY: help demo docs test test-slow coverage mutants logs check format images clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' Makefile
@@ -54,6 +54,11 @@ mutants: $(VENV)/dev.stamp  ## mutation tests of the safety layer: at least 90 %
 	rm -rf mutants
 	$(BIN)/mutmut run --max-children 2
 	$(BIN)/python tests/mutation/report.py
+
+logs: export OMP_NUM_THREADS = 1
+logs: export OPENBLAS_NUM_THREADS = 1
+logs: $(VENV)/dev.stamp  ## fly the logs of tests/logs again, after a change that is meant to answer otherwise
+	$(BIN)/python tests/logs/make.py
 
 check: $(VENV)/dev.stamp  ## lint, format check, types
 	$(BIN)/ruff check .

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from companion import __version__
+from companion import __version__, realtime
 from companion.errors import CompanionError, ConfigError
 from companion.logging_setup import LEVELS, set_up_logging
 
@@ -49,12 +49,18 @@ def build_parser() -> argparse.ArgumentParser:
     from companion.bench import command as bench
     from companion.demo import command as demo
     from companion.doctor import command as doctor
+    from companion.explain import command as explain
+    from companion.logbook import command as logbook
     from companion.monitor import command as monitor
+    from companion.replay import command as replay
 
     demo.add_parser(commands)
     publish.add_parser(commands)
     monitor.add_parser(commands)
     doctor.add_parser(commands)
+    logbook.add_parser(commands)
+    replay.add_parser(commands)
+    explain.add_parser(commands)
     bench.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")
     schema.add_argument("key", nargs="?", help="one key suffix, such as companion/setpoint; all where left out")
@@ -66,8 +72,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # small matrices: threads only add latency
-        os.environ.setdefault(name, "1")
+    realtime.single_threads()  # before anything imports numpy
     arguments = build_parser().parse_args(argv)
     try:
         return int(arguments.handler(arguments))

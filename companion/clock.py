@@ -64,3 +64,8 @@ class ManualClock:
 def stopwatch_ns() -> int:
     """A reading for latency figures only; it never enters the brain."""
     return time.perf_counter_ns()
+
+
+def processor_ns() -> int:
+    """Processor time that this thread has used, for benches: unlike the stopwatch it does not run while others do."""
+    return time.thread_time_ns()

@@ -25,6 +25,7 @@ from companion.config_check import (
     pointed,
 )
 from companion.config_links import HttpConfig, MavlinkConfig, Ros2Config, ZenohConfig
+from companion.config_realtime import RealtimeConfig
 from companion.config_traffic import UNTRUSTED, TrafficConfig, check_traffic
 from companion.config_types import Acceleration, Name, NonNegative, Point, Positive, Section, SourceName, Stay
 from companion.errors import ConfigError
@@ -190,6 +191,7 @@ class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     log: LogConfig = LogConfig()
     params: ParamsConfig = ParamsConfig()
     http: HttpConfig = HttpConfig()
+    realtime: RealtimeConfig = RealtimeConfig()
 
     @property
     def profile(self) -> Profile:
@@ -332,9 +334,8 @@ def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str
 
 
 def config_hash(config: Config) -> str:
-    """SHA-256 of the resolved configuration, but for what changes no flight: where files lie, who may watch."""
+    """SHA-256 of the resolved configuration, but for what changes no flight: where files lie, who may watch, threads."""
     values = msgspec.to_builtins(config)
-    values.pop("log")
-    values.pop("params")
-    values.pop("http")
+    for section in ("log", "params", "http", "realtime"):
+        values.pop(section)
     return hashlib.sha256(msgspec.json.encode(values, order="sorted")).hexdigest()

@@ -22,6 +22,7 @@ from companion import __version__
 from companion.tlog import entry
 
 CHUNK_BYTES = 65536  # what the writer holds back between two flushes at most
+ABOUT = "companion"
 NEXT, PREVIOUS = "companion.next", "companion.previous"  # metadata records that chain the parts of a flight
 
 
@@ -45,10 +46,10 @@ class Topic:
 class LogFiles:
     """The part that is being written. ``path``: the first of this flight."""
 
-    def __init__(self, path: Path, limits: Limits, *, tlog: bool, metadata: dict[str, str]) -> None:
+    def __init__(self, path: Path, limits: Limits, *, tlog: bool) -> None:
         self._limits = limits
         self._tlog_wanted = tlog
-        self._metadata = metadata
+        self._about: dict[str, str] = {}
         self._topics: dict[str, Topic] = {}
         self._standing: dict[str, tuple[int, bytes]] = {}  # what every part begins with
         self._template = path
@@ -62,7 +63,8 @@ class LogFiles:
         self._writer: Any = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         self._channels: dict[str, int] = {}
         self._writer.start(profile="", library=f"companion {__version__}")
-        self._writer.add_metadata("companion", self._metadata)
+        if self._about:
+            self._writer.add_metadata(ABOUT, self._about)
         if previous is not None:
             self._writer.add_metadata(PREVIOUS, {"file": previous})
         for topic in self._topics:
@@ -72,6 +74,11 @@ class LogFiles:
         if self._tlog_wanted:
             self._tlog = self._part.with_suffix(".tlog").open("xb")
         self._prune()
+
+    def describe(self, about: dict[str, str]) -> None:
+        """A metadata record on what wrote the file, in this part and those to come."""
+        self._about = about
+        self._writer.add_metadata(ABOUT, about)
 
     def declare(self, topic: str, name: str, schema: bytes) -> None:
         """A topic and its schema, before its first message."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class TickMeter:
     def __init__(self, period_s: float) -> None:
         self.set_period(period_s)
         self.ticks = 0
-        self._latencies_ms: deque[float] = deque(maxlen=WINDOW)
+        self._latencies_ms = np.full(WINDOW, np.nan)  # a ring: the status asks for quantiles five times a second
         self.verdicts: Counter[str] = Counter()
         self.bucket_counts = [0] * (len(BUCKETS_MS) + 1)  # ticks by latency, the last above every bound
         self.latency_sum_ms = 0.0
@@ -38,8 +38,8 @@ class TickMeter:
 
     def tick(self, latency_ms: float, busy_ms: float, verdict: str) -> None:
         """One tick: state received to setpoint sent, and to the end of all its work."""
+        self._latencies_ms[self.ticks % WINDOW] = latency_ms
         self.ticks += 1
-        self._latencies_ms.append(latency_ms)
         self.bucket_counts[bisect_left(BUCKETS_MS, latency_ms)] += 1
         self.latency_sum_ms += latency_ms
         self.verdicts[verdict] += 1
@@ -48,15 +48,16 @@ class TickMeter:
 
     def quantiles_ms(self, last: int | None = None) -> dict[str, float]:
         """p50, p99, p99.9 and max over the ``last`` ticks (at most WINDOW); empty before the first tick."""
-        values = list(self._latencies_ms)[-(last or WINDOW) :]
-        if not values:
+        count = min(self.ticks, last or WINDOW, WINDOW)
+        if not count:
             return {}
+        values = self._latencies_ms[np.arange(self.ticks - count, self.ticks) % WINDOW]
         p50, p99, p999 = np.quantile(values, [0.5, 0.99, 0.999])
         return {
             "p50": round(float(p50), 4),
             "p99": round(float(p99), 4),
             "p99.9": round(float(p999), 4),
-            "max": round(max(values), 4),
+            "max": round(float(values.max()), 4),
         }
 
     def counts(self, groups: Mapping[str, Mapping[str, int]]) -> dict[str, int]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
@@ -82,6 +83,34 @@ class PilotOutput:
     origin_moved_m: float | None = None  # the estimator was reset with this tick's state
 
 
+def acts_after_ns(config: Config) -> int:
+    """From the stamp of a vehicle state to the instant at which the setpoint that answers it acts [ns]."""
+    return round((config.delay.loop_s + config.actuation_s) * NS_PER_S)
+
+
+def at_action(vehicle: VehicleState, commanded: Iterable[tuple[int, Vec3]], delay_ns: int) -> tuple[Vec3, Vec3]:
+    """Position and velocity at the instant at which the setpoint of this tick acts.
+
+    p += v t + a t^2 / 2, v += a t over each piece of [stamp, stamp + delay) under the command acting in it;
+    before the first command the vehicle is taken to coast.
+
+    Args:
+        commanded: (acts from [ns], net acceleration [m/s^2]) of the commands before, in order.
+    """
+    p, v = vehicle.p_enu, vehicle.v_enu
+    now, end = vehicle.stamp_ns, vehicle.stamp_ns + delay_ns
+    commands = list(commanded)
+    for index, (since, a) in enumerate(commands):
+        until = commands[index + 1][0] if index + 1 < len(commands) else end
+        t = (min(until, end) - max(since, now)) / NS_PER_S
+        if t > 0.0:
+            p = p + v * t + a * (0.5 * t * t)
+            v = v + a * t
+    commanded_from = max(now, commands[0][0]) if commands else end
+    coast_s = max(0, min(end, commanded_from) - now) / NS_PER_S
+    return p + vehicle.v_enu * coast_s, v
+
+
 class Pilot:
     """Tracker, policy and safety filter behind ``step``.
 
@@ -100,7 +129,7 @@ class Pilot:
         self._filter = SafetyFilter(config.safety, config.limits)
         self._observer = DisturbanceObserver(config.disturbance, lag_s=config.response_lag_s)
         self._origin = OriginWatch()
-        self._delay_ns = round((config.delay.loop_s + config.actuation_s) * NS_PER_S)
+        self._delay_ns = acts_after_ns(config)
         self._history_len = 2 + math.ceil(self._delay_ns * config.rate_hz / NS_PER_S)
         self.reset()
 
@@ -134,6 +163,11 @@ class Pilot:
         self._config = config
         self._tracker.retune(config.safety.drone_radius_m)
         self._filter.retune(config.safety, config.limits)
+
+    @property
+    def artifact(self) -> str | None:
+        """SHA-256 of the manifest of the policy's artefact; None for a reference law of your own."""
+        return self._policy.digest if isinstance(self._policy, Policy) else None
 
     def tracks(self) -> TrackTable:
         """The tracks as the last step left them; apart from it, because nobody waits for them."""
@@ -238,23 +272,7 @@ class Pilot:
         return moved_m
 
     def _at_action(self, vehicle: VehicleState) -> tuple[Vec3, Vec3]:
-        """Position and velocity at the instant at which this tick's setpoint acts.
-
-        p += v t + a t^2 / 2, v += a t over each piece of [stamp, stamp + delay) under the command acting in it;
-        before the first command the vehicle is taken to coast.
-        """
-        p, v = vehicle.p_enu, vehicle.v_enu
-        now, end = vehicle.stamp_ns, vehicle.stamp_ns + self._delay_ns
-        commands = list(self._commands)
-        for index, (since, a) in enumerate(commands):
-            until = commands[index + 1][0] if index + 1 < len(commands) else end
-            t = (min(until, end) - max(since, now)) / NS_PER_S
-            if t > 0.0:
-                p = p + v * t + a * (0.5 * t * t)
-                v = v + a * t
-        commanded_from = max(now, commands[0][0]) if commands else end
-        coast_s = max(0, min(end, commanded_from) - now) / NS_PER_S
-        return p + vehicle.v_enu * coast_s, v
+        return at_action(vehicle, self._commands, self._delay_ns)
 
     def _reference(self, inputs: PilotInput, p_act: Vec3, v_act: Vec3) -> tuple[Vec3, bool]:
         """The reference acceleration, and whether the policy's output was usable."""

@@ -27,7 +27,6 @@ IGNORE_VELOCITY = 0x0038  # POSITION_TARGET_TYPEMASK bits 4 to 6
 
 AUTOPILOT_ARDUPILOT, AUTOPILOT_PX4 = 3, 12  # MAV_AUTOPILOT
 
-ECHO_ALL = 0x0FFF  # the mask comes back as it was sent
 ECHO_AXES = 0x01FF  # position, velocity, acceleration
 ECHO_NO_VELOCITY = 0x01C7  # position, acceleration
 
@@ -86,7 +85,7 @@ PROFILES: dict[str, Profile] = {
             slew_m_s3=None,
             streams_when_ready=True,
             engage_by="command",
-            echo_bits=ECHO_ALL,
+            echo_bits=ECHO_AXES,
             echo_exact=True,
         ),
         Profile(

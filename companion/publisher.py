@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import msgspec
 
+from companion import journal_format
 from companion.config import Config
+from companion.journal import Journal
 from companion.link import wire
 from companion.link.zenoh import ZenohLink
 from companion.metrics import TickMeter
 from companion.pilot import PilotOutput
 from companion.record import Recorder
 from companion.report import FlightHash, tracks_out, vehicle_out
+from companion.scene_log import SceneLog
 from companion.session import VehicleSession
 from companion.state import State
 from companion.tracking.agility import AGILE
@@ -24,12 +28,33 @@ log = logging.getLogger("companion")
 STATUS_NS = NS_PER_S // 5
 
 
+class Watcher(Protocol):
+    """Whoever is shown the newest tick and status inside the daemon; must not raise."""
+
+    def tick(
+        self, record: wire.SetpointRecord, vehicle: VehicleState, output: PilotOutput | None, table: TrackTable
+    ) -> None: ...
+
+    def status(self, status: wire.Status) -> None: ...
+
+
 class Publisher:
     """Publishes and logs; the record goes out first, because in lockstep the simulator waits for it."""
 
-    def __init__(self, zenoh: ZenohLink, recorder: Recorder | None) -> None:
+    def __init__(
+        self,
+        zenoh: ZenohLink,
+        recorder: Recorder | None,
+        scenes: SceneLog | None = None,
+        journal: Journal | None = None,
+    ) -> None:
         self._zenoh = zenoh
+        self._scenes = scenes
         self._recorder = recorder
+        self.watcher: Watcher | None = None
+        self._journal = journal
+        if recorder is not None and journal is not None:
+            recorder.declare(journal_format.TOPIC, "BrainCall", journal_format.schema())
         self._hash = FlightHash()
         self._verdict = "silent"
         self.tracks = 0  # of the last tick
@@ -37,9 +62,9 @@ class Publisher:
         self._last: tuple[int, object] | None = None
 
     @property
-    def log_counts(self) -> Mapping[str, int]:
+    def log_counts(self) -> dict[str, int]:
         """Messages that did not get into the log; empty without one."""
-        return {} if self._recorder is None else self._recorder.counts
+        return {} if self._recorder is None else dict(self._recorder.counts)
 
     @property
     def log_hash(self) -> str:
@@ -64,6 +89,7 @@ class Publisher:
         output: PilotOutput | None,
         tracks: Callable[[], TrackTable],
         arrived_unix_ns: int | None = None,
+        target_enu: Vec3 | None = None,
     ) -> None:
         """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left.
 
@@ -76,11 +102,16 @@ class Publisher:
         self.tracks = len(table)
         self.agile = [name for name, agile in zip(table.ids, (table.growth >= AGILE).tolist(), strict=True) if agile]
         if self._recorder is not None:
-            self._recorder.frames(frames, vehicle.stamp_ns)
+            if self._journal is not None:
+                self._journal.write(self._recorder, frames)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
         self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle, arrived_unix_ns))
         if output is not None:
             self._offer("companion/tracks", vehicle.stamp_ns, lambda: tracks_out(output, table))
+        if self._scenes is not None:
+            self._scenes.tick(record, vehicle, output, table, target_enu)
+        if self.watcher is not None:
+            self.watcher.tick(record, vehicle, output, table)
         self._hash.tick(state, vehicle, frames, output, table)
 
     def _offer(self, key: str, stamp_ns: int, build: Callable[[], msgspec.Struct]) -> None:
@@ -98,11 +129,15 @@ class Publisher:
         """The profile is settled, or live parameters changed: the log says what holds from here on."""
         if self._recorder is not None:
             self._recorder.config(config, stamp_ns)
+        if self._scenes is not None:
+            self._scenes.configured(config)
 
     def keep_log(self) -> str | None:
         """The tick is over: let the log be written. What has befallen it since the last call, or None."""
         if self._recorder is None:
             return None
+        if self._journal is not None:
+            self._journal.write(self._recorder)
         self._recorder.kick()
         return self._recorder.trouble()
 
@@ -146,5 +181,7 @@ class Publisher:
             sources=sources(),
         )
         self._zenoh.put("companion/status", status)
+        if self.watcher is not None:
+            self.watcher.status(status)
         if self._recorder is not None:
             self._recorder.message("/companion/status", vehicle_ns, wire.encode(status))

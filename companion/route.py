@@ -27,6 +27,11 @@ class Route:
         """The waypoint flown to now, ENU [m]; None: hold where engaged."""
         return self._waypoints[0] if self._waypoints else None
 
+    @property
+    def waypoints(self) -> tuple[Vec3, ...]:
+        """The waypoint flown to now and those after it."""
+        return self._waypoints
+
     def retune(self, limits: LimitsConfig) -> None:
         """Another arena for every target to come; ask `check` before."""
         self._limits = limits

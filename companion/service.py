@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import logging
 from pathlib import Path
 
+from companion import realtime
 from companion.clock import Clock, stopwatch_ns
 from companion.config import Config
 from companion.doors import Doors
 from companion.errors import CompanionError
+from companion.journal import Journal
 from companion.link import mav
 from companion.link.events import Event, TimesyncReply, TimesyncRequest
 from companion.link.inbox import ObstacleInbox
@@ -35,6 +36,7 @@ from companion.publisher import Publisher
 from companion.record import Recorder
 from companion.report import setpoint_record, sources_out
 from companion.route import Route
+from companion.scene_log import SceneLog
 from companion.sdnotify import Notifier
 from companion.session import VehicleSession
 from companion.state import FLYING
@@ -82,7 +84,9 @@ class Service:
         )
         self._session.origin = lambda: self._traffic.origin
         self._barrier = LockstepBarrier(config, self._inbox, clock)
-        self._thinker = Thinker(config, Pilot(config) if pilot is None else pilot, self._inbox, self._session)
+        pilot = Pilot(config) if pilot is None else pilot
+        self._journal = None if config.log.directory is None else Journal(pilot, config, artifact=pilot.artifact)
+        self._thinker = Thinker(config, self._journal or pilot, self._inbox, self._session)
         self._time = TimeBase(clock, self._codec, self._transport.send, self._on_restart, runs=not self._lockstep)
         self._time.on_step = self._session.watch.unix_stepped
         self._meter = TickMeter(1.0 / config.rate_hz)
@@ -102,6 +106,7 @@ class Service:
         )
         parts = self._session, self._meter, self._inbox, self._transport
         self._vitals = Vitals(clock, notifier or Notifier(None), *parts, self._groups, lambda: self._vehicle_ns)
+        self._garbage = realtime.Collector()
         self._wake = asyncio.Event()
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
@@ -126,30 +131,45 @@ class Service:
         loop = asyncio.get_running_loop()
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._vitals.close)
-            recorder = None
-            if config.log.directory is not None:
-                recorder = Recorder(Path(config.log.directory) / "flight.mcap", config)
-                stack.callback(recorder.close)
+            recorder, scenes = self._open_log(stack)
+            realtime.apply(config.realtime, log.warning)  # behind the recorder, before the links' threads
             await self._transport.open()
             stack.push_async_callback(self._transport.close)
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
-            self._publisher = Publisher(zenoh, recorder)
+            self._publisher = Publisher(zenoh, recorder, scenes, self._journal)
             if config.http.enabled:
                 await self._serve_http(stack)
-            gc.collect()
-            gc.freeze()  # what exists now lives as long as the daemon: no later collection has to walk it
+            self._garbage.take_over(realtime.load_seldom(wait=config.safety.solver == "osqp"))
+            stack.callback(self._garbage.hand_back)
             self._vitals.up(self._publisher)
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
 
+    def _open_log(self, stack: contextlib.AsyncExitStack) -> tuple[Recorder | None, SceneLog | None]:
+        """The log, where one is wanted, and who draws for it; it hears of packets and texts from now on."""
+        config = self._config
+        if config.log.directory is None:
+            return None, None
+        recorder = Recorder(Path(config.log.directory) / "flight.mcap", config, self._clock)
+        stack.callback(recorder.close)
+        self._transport.on_packet = recorder.packet if config.log.tlog else None
+        self._session.on_text = lambda severity, text: recorder.text(self._vehicle_ns, severity, text)
+        return recorder, SceneLog(recorder, config, lambda: self._traffic.origin) if config.log.scene_hz > 0.0 else None
+
     async def _serve_http(self, stack: contextlib.AsyncExitStack) -> None:
         """Whatever is read by HTTP; aiohttp is imported only where it serves."""
         from companion.http import HttpServer
+        from companion.page.access import Access
+        from companion.page.feed import PageFeed
+        from companion.page.handlers import Page
         from companion.probes import add_probes
 
         server = HttpServer(self._config.http)
+        feed = PageFeed(self._session, self._route, self._inbox, self._transport, self._clock)
+        Page(server, feed, Access(self._config.http, self._doors), self._clock)
+        self._publisher.watcher = feed
         add_probes(server, self._vitals)
         await server.start()
         stack.push_async_callback(server.stop)
@@ -197,6 +217,8 @@ class Service:
                 self._barrier.check_simulator(self._vehicle_ns)
             self._housekeeping()
             self._vitals.beat()
+            if self._pending is None:
+                self._garbage.idle(self._arrived_ns + NS_PER_S // self._config.rate_hz)
             if deadline_ns is not None and (
                 self._session.situation.state not in FLYING or self._clock.monotonic_ns() >= deadline_ns
             ):
@@ -236,8 +258,16 @@ class Service:
         }
         state = session.situation.state
         record = setpoint_record(vehicle.stamp_ns, state, output, sent=sent, messages=messages, timings_ms=timings_ms)
-        arrived_ns, tracks = self._arrived_unix_ns, self._thinker.tracks
-        self._publisher.tick(record, state, vehicle, taken.frames, output, tracks, arrived_unix_ns=arrived_ns)
+        self._publisher.tick(
+            record,
+            state,
+            vehicle,
+            taken.frames,
+            output,
+            self._thinker.tracks,
+            arrived_unix_ns=self._arrived_unix_ns,
+            target_enu=self._route.current,
+        )
         self._services.note(vehicle, output)
         busy_ms = (stopwatch_ns() - started_ns) / 1e6
         self._meter.tick(timings_ms["total"], busy_ms, record.verdict)

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 from companion.clock import stopwatch_ns
 from companion.config import Config
+from companion.journal import Brain
 from companion.link.inbox import ObstacleInbox
-from companion.pilot import Pilot, PilotInput, PilotOutput, Task
+from companion.pilot import PilotInput, PilotOutput, Task
 from companion.session import VehicleSession
 from companion.state import State
 from companion.types import NS_PER_S, DetectionFrame, TrackTable, Vec3, VehicleState
@@ -36,7 +37,7 @@ class TickFrames:
 class Thinker:
     """One pilot behind a guard."""
 
-    def __init__(self, config: Config, pilot: Pilot, inbox: ObstacleInbox, session: VehicleSession) -> None:
+    def __init__(self, config: Config, pilot: Brain, inbox: ObstacleInbox, session: VehicleSession) -> None:
         self._config = config
         self._pilot = pilot
         self._inbox = inbox

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import IO, Any
 
 from sim_bridge import bench, render
@@ -200,7 +200,8 @@ def _run(arguments: argparse.Namespace) -> int:
             runner = RealTime(
                 flight, wires, trace=trace, progress=_progress(), stay=arguments.stay, speed=arguments.speed
             )
-        with _stopped_by_signals(runner.stop):
+        with _StoppedBySignals() as stop:
+            stop.listen(runner.stop)
             summary = runner.run()
     _report(summary, as_json=arguments.json)
     missed = arguments.must_reach and not summary["reached"]
@@ -218,6 +219,7 @@ def _check(arguments: argparse.Namespace) -> int:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ScenarioError(f"--logs {folder}: cannot be made ({error.strerror})") from None
+        stop = stack.enter_context(_StoppedBySignals())  # from the first daemon on: none may outlive this process
         result = check(
             name,
             scenario,
@@ -228,7 +230,7 @@ def _check(arguments: argparse.Namespace) -> int:
             progress=_progress(),
             log_flight=arguments.logs is not None,
             obstacles=not arguments.no_obstacles,
-            on_stop=lambda stop: stack.enter_context(_stopped_by_signals(stop)),
+            on_stop=stop.listen,
         )
     if sys.stderr.isatty():
         print(file=sys.stderr)
@@ -255,19 +257,31 @@ def _opened(path: Path | None) -> Iterator[IO[bytes] | None]:
         yield file
 
 
-@contextmanager
-def _stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """SIGINT and SIGTERM end the run instead of the process."""
+class _StoppedBySignals:
+    """SIGINT and SIGTERM end the run instead of the process; the coming run, where there is none yet."""
 
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop()
+    def __init__(self) -> None:
+        self._stop: Callable[[], None] | None = None
+        self._asked = False
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
+    def listen(self, stop: Callable[[], None]) -> None:
+        """``stop`` ends the run; at once if it was asked for."""
+        self._stop = stop
+        if self._asked:
+            stop()
+
+    def __enter__(self) -> _StoppedBySignals:
+        self._before = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True
+        if self._stop is not None:
+            self._stop()
 
 
 def _progress() -> Callable[[Flight], None]:

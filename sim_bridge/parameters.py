@@ -119,7 +119,7 @@ class Parameters:
     def write(self, name: str, value: float | int, *, is_int: bool) -> bool:
         """Set a known parameter; False (and unchanged) for a wrong type or a value out of range."""
         definition = self._definitions[name]
-        if is_int != isinstance(definition.default, int):
+        if is_int != isinstance(definition.default, int) or (is_int and not isinstance(value, int)):
             return False
         if not math.isfinite(value) or not definition.low <= value <= definition.high:
             return False

@@ -44,6 +44,7 @@ ModeName = Annotated[str, Meta(pattern=r"^[A-Z][A-Z0-9_]{0,31}$")]  # of the aut
 Words = Annotated[str, Meta(min_length=1, max_length=200)]  # part of a STATUSTEXT
 
 LINKS = ("onboard", "ground")
+_JUMP_MAX_S = 1e6  # time_boot_ms, 32 bits, ends at 4.3e6 s
 MESSAGES = frozenset({"drop", "delay", "duplicate", "reorder", "corrupt", "cut"})
 _SHARED = MESSAGES - {"cut"}
 _PLACES: dict[str, tuple[str, ...]] = {
@@ -57,7 +58,7 @@ _PLACES: dict[str, tuple[str, ...]] = {
 }
 _VALUES: dict[str, str] = {
     "delay": "a delay above 0 s",
-    "clock_jump": "a jump in s other than 0",
+    "clock_jump": "a jump in s other than 0, at most 1e6 either way",
     "gust": "a wind [east, north, up] in m/s",
     "battery": "a state of charge, 0 to 1",
     "rc": "a mode's name, or none",
@@ -120,6 +121,8 @@ def fault_error(fault: Fault, *, sources: Collection[str], vehicles: Collection[
         return "for_s: expected none for kill"
     if fault.share != 1.0 and fault.what not in _SHARED:
         return f"share: expected only with {', '.join(sorted(_SHARED))}"
+    if fault.expect is not None and fault.expect == FaultExpectation(within_s=fault.expect.within_s):
+        return "expect: expected state, verdict, mode or text"
     if not _value_fits(fault):
         return f"value: expected {_VALUES.get(fault.what, 'none')} for {fault.what}, got {fault.value}"
     return None
@@ -130,7 +133,7 @@ def _value_fits(fault: Fault) -> bool:
     if fault.what == "delay":
         return isinstance(value, float) and 0.0 < value <= 10.0
     if fault.what == "clock_jump":
-        return isinstance(value, float) and value != 0.0
+        return isinstance(value, float) and 0.0 < abs(value) <= _JUMP_MAX_S
     if fault.what == "gust":
         return isinstance(value, tuple)
     if fault.what == "battery":

@@ -86,6 +86,19 @@ class GroundStation:
         if ack.result != 0:
             raise RuntimeError(f"ground station: command {command} answered with MAV_RESULT {ack.result}")
 
+    def set_parameter(self, name: str, value: float, component: int = COMPANION) -> None:
+        """PARAM_SET to a component of system 1, until it has answered with the new value."""
+        if self._peer is None:
+            self.wait(lambda message: message.get_type() == "HEARTBEAT", "heartbeat")
+        assert self._peer is not None
+        real32 = self._dialect.MAV_PARAM_TYPE_REAL32
+        message = self._dialect.MAVLink_param_set_message(1, component, name.encode(), value, real32)
+        self._socket.sendto(message.pack(self._codec), self._peer)
+        self.wait(
+            lambda m: m.get_type() == "PARAM_VALUE" and m.param_id == name and abs(m.param_value - value) < 1e-6,
+            f"PARAM_VALUE of {name}",
+        )
+
 
 class FlyingPair:
     """A simulator and a daemon that talk to each other; made by the ``flying_pair`` fixture."""

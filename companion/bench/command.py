@@ -12,6 +12,8 @@ from typing import Any
 
 import msgspec
 
+from companion.bench import tick_command
+
 _EPILOG = """\
 examples:
   companion bench tracking                accuracy, identity and time of the tracker beside its rivals (minutes)
@@ -20,6 +22,9 @@ examples:
   companion bench filter                  time of the safety filter beside cbfpy, OSQP and quadprog (minutes)
   companion bench filter --quick --json   fewer states and flights, one JSON object
   companion bench wire                    obstacle frame to setpoint on real sockets, and messages parsed a second
+  companion bench tick                    the whole tick beside the simulator at 20, 50 and 100 Hz (half an hour)
+  companion bench tick --quick --json     15 s at each rate, one JSON object
+  companion bench memory                  resident memory over an hour of vehicle time (some minutes)
 """
 
 _TRACKING = """\
@@ -70,6 +75,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     safety.add_argument("--quick", action="store_true", help="the conditions with figures only, on fewer states")
     wire = _add_part(parts, "wire", _wire, "obstacle frame to setpoint, and messages parsed a second", _WIRE)
     wire.add_argument("--quick", action="store_true", help="12 s of flight instead of 90, 10 s of load instead of 60")
+    told = "the whole tick beside the simulator, deadlines, the brain by obstacles, start to READY"
+    tick = _add_part(parts, "tick", partial(tick_command.run_tick, print_json=_print_json), told, tick_command.TICK)
+    told = "resident memory of the daemon over an hour of vehicle time"
+    run = partial(tick_command.run_memory, print_json=_print_json)
+    tick_command.add_arguments(tick, _add_part(parts, "memory", run, told, tick_command.MEMORY))
 
 
 def _add_part(

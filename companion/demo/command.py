@@ -8,18 +8,29 @@ import errno
 import json
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from companion.demo.flight import FlightFailed, FlightPlan, FlightResult, check_daemon, describe_scenario, fly
+from companion.demo.flight import (
+    FlightFailed,
+    FlightPlan,
+    FlightResult,
+    check_daemon,
+    describe_scenario,
+    fly,
+    free_port,
+)
+from companion.demo.watch import show_page
 from companion.errors import ConfigError
 
 _EPILOG = """\
 examples:
   companion demo                                     real time, three figure-eight obstacles
+  companion demo --watch                             the same, seen in a browser
   companion demo --lockstep --json --seed 3          as fast as the machine can, reproducible
   companion demo --lockstep --filter none            the control: without the filter it collides
 """
@@ -37,6 +48,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     demo.add_argument("--scenario", default="demo", metavar="NAME", help="a shipped scenario or a TOML file")
     demo.add_argument("--seed", type=int, default=0, help="fixes obstacles and sensor noise (default 0)")
     demo.add_argument("--lockstep", action="store_true", help="simulated time waits for the daemon: fast, reproducible")
+    demo.add_argument("--watch", action="store_true", help="open the daemon's live page in a browser (real time)")
     demo.add_argument("--filter", choices=("acbf", "none"), default="acbf", help="safety filter (default acbf)")
     demo.add_argument("-c", "--config", type=Path, metavar="FILE", help="the daemon's base configuration")
     demo.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="daemon key")
@@ -59,6 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    if arguments.watch and arguments.lockstep:
+        raise ConfigError("demo: --watch: expected without --lockstep, which flies faster than anyone can watch")
     described = describe_scenario(arguments.scenario, arguments.seed)
     if described["target"] is None:
         raise ConfigError(f"scenario {arguments.scenario}: target: expected a position, the demo flies to it")
@@ -74,6 +88,7 @@ def _run(arguments: argparse.Namespace) -> int:
         target=tuple(described["target"]),
         sources=tuple(described["sources"]),
         control_hz=described["control_hz"],
+        http_port=free_port(socket.SOCK_STREAM) if arguments.watch else None,
     )
     check_daemon(plan)
     _make_folder(folder)
@@ -124,10 +139,21 @@ async def _fly_both(plan: FlightPlan, show: Callable[[str], None]) -> tuple[Flig
     """First without obstacles, in lockstep whatever was asked for: same plant, policy and filter, and fast."""
     import dataclasses
 
-    bare = dataclasses.replace(plan, folder=plan.folder / "unobstructed", obstacles=False, lockstep=True)
+    folder = plan.folder / "unobstructed"
+    bare = dataclasses.replace(plan, folder=folder, obstacles=False, lockstep=True, http_port=None)
     free = await fly(bare, lambda step: show(f"unobstructed flight: {step}"))
-    flight = await fly(plan, lambda step: show(f"flight: {step}"))
+    opening = None if plan.http_port is None else asyncio.create_task(show_page(plan.http_port, _tell_page))
+    try:
+        flight = await fly(plan, lambda step: show(f"flight: {step}"))
+    finally:
+        if opening is not None:
+            opening.cancel()
+            await asyncio.gather(opening, return_exceptions=True)
     return free, flight
+
+
+def _tell_page(url: str, opened: bool) -> None:
+    print(f"page     {url}" + ("" if opened else "  (open it: no browser was found)"), file=sys.stderr, flush=True)
 
 
 def _report(free: FlightResult, flight: FlightResult) -> dict[str, Any]:

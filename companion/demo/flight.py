@@ -39,6 +39,7 @@ class FlightPlan:
     target: tuple[float, float, float]
     sources: tuple[str, ...]
     control_hz: int
+    http_port: int | None = None  # of the daemon's page; None: none is served
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +77,8 @@ async def fly(plan: FlightPlan, on_progress: Callable[[str], None]) -> FlightRes
         FlightFailed: a process died or said no.
     """
     plan.folder.mkdir(parents=True, exist_ok=True)
-    onboard, gcs = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
-    endpoint = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
+    onboard, gcs = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     trace = plan.folder / "truth.jsonl"
     daemon_words = ["companion.cli", "run", "--json", *_daemon_arguments(plan, onboard, endpoint)]
     sim_words = ["sim_bridge.cli", "run", "--scenario", plan.scenario, "--seed", str(plan.seed), "--json"]
@@ -213,12 +214,14 @@ def _daemon_settings(plan: FlightPlan, onboard: int, endpoint: str) -> tuple[str
         f"tick_hz={plan.control_hz}",
         f"log.directory={json.dumps(str(plan.folder))}",
     ]
+    settings += ["http.enabled=false"] if plan.http_port is None else [f"http.port={plan.http_port}"]
     if plan.lockstep:
         settings += ['sync="lockstep"', f"lockstep_sources={json.dumps(list(plan.sources))}"]
     return (*settings, *plan.overrides)
 
 
-def _free_port(kind: socket.SocketKind) -> int:
+def free_port(kind: socket.SocketKind) -> int:
+    """A port on 127.0.0.1 that nobody holds now."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 
 import daqp
 import numpy as np
-import osqp
-import scipy.sparse as sparse
 
 from companion.errors import SolverError
 from companion.types import FloatArray
@@ -82,6 +80,9 @@ def solve_osqp(program: Program) -> FloatArray | None:
     Raises:
         Infeasible: a certificate of primal infeasibility was found.
     """
+    import osqp  # brings scipy.sparse, which takes longer to load than all the rest: not before READY
+    from scipy import sparse
+
     solver = osqp.OSQP()
     solver.setup(
         sparse.csc_matrix(np.diag(program.weight)),

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from companion.types import FloatArray
 
@@ -52,6 +51,8 @@ def associate(z: FloatArray, noise: FloatArray, tracks: Candidates, gate_sigma: 
     rows = np.full(len(z), -1, dtype=np.intp)
     if not len(z) or not len(tracks):
         return rows
+    from scipy.optimize import linear_sum_assignment  # slow to load and for anonymous detections only: not before READY
+
     detection, track = _near(z, noise, tracks, gate_sigma)
     innovation = z[detection, None] - tracks.p_enu[track]
     s = noise[detection, None] + tracks.covariance[track]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -20,10 +21,18 @@ LAYERS = [
         "companion.config",
         "companion.config_check",
         "companion.config_links",
+        "companion.config_realtime",
         "companion.config_traffic",
         "companion.config_types",
     },
-    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload", "companion.tlog"},
+    {
+        "companion.tunables",
+        "companion.threats",
+        "companion.texts",
+        "companion.hostload",
+        "companion.tlog",
+        "companion.realtime",
+    },
     {
         "companion.tracking",
         "companion.safety",
@@ -32,9 +41,11 @@ LAYERS = [
         "companion.disturbance",
         "companion.origin",
     },
-    {"companion.pilot"},
+    {"companion.numerics", "companion.pilot"},
+    {"companion.journal_format"},
+    {"companion.journal"},
     {"companion.state"},
-    {"companion.log_files"},
+    {"companion.log_files", "companion.foxglove", "companion.provenance"},
     {"companion.log_writer"},
     {
         "companion.link",
@@ -45,7 +56,8 @@ LAYERS = [
         "companion.sdnotify",
         "companion.logging_setup",
     },
-    {"companion.prometheus", "companion.health", "companion.instruments"},
+    {"companion.scene", "companion.prometheus", "companion.health", "companion.instruments"},
+    {"companion.scene_log"},
     {
         "companion.notices",
         "companion.confirm",
@@ -65,9 +77,9 @@ LAYERS = [
         "companion.doors",
         "companion.http",
     },
-    {"companion.vitals", "companion.page"},
-    {"companion.probes"},
-    {"companion.logbook"},
+    {"companion.vitals", "companion.page", "companion.logbook"},
+    {"companion.probes", "companion.replay"},
+    {"companion.explain"},
     {
         "companion.service",
         "companion.publish",
@@ -92,6 +104,7 @@ BRAIN = (
 NOT_IN_BRAIN = {"asyncio", "socket", "time", "random", "os", "logging", "threading", "datetime"}
 HEAVY = {"torch", "pybullet", "matplotlib", "filterpy", "mavsdk", "stable_baselines3", "gymnasium"}
 HEAVY |= {"cbfpy", "jax", "quadprog", "rosbags"}
+SELDOM = {"scipy", "osqp", "jinja2", "rich", "pandas", "PIL", "IPython", "unittest", "multiprocessing"}
 
 
 def modules(folder: str) -> list[Path]:
@@ -199,6 +212,24 @@ def test_the_daemon_starts_without_the_heavy_packages() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_a_start_loads_nothing_that_takes_long_and_is_seldom_needed() -> None:
+    """Start to READY is mostly imports; scipy alone would take as long as all the rest."""
+    script = """
+import json, sys
+from companion.cli import build_parser
+build_parser()
+from companion.clock import SystemClock
+from companion.config import parse_config
+from companion.service import Service
+Service(parse_config({}), SystemClock())
+print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    loaded = set(json.loads(done.stdout))
+    assert {"numpy", "zenoh", "onnxruntime", "daqp"} <= loaded, "the check sees what is loaded"
+    assert not loaded & (HEAVY | SELDOM), loaded & (HEAVY | SELDOM)
 
 
 def test_frame_conversion_of_the_simulator_is_its_own() -> None:

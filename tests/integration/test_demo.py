@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from companion.cli import main
+
 pytestmark = pytest.mark.integration
 
 
@@ -41,6 +43,7 @@ def test_same_seed_same_flight_to_the_bit(tmp_path: Path) -> None:
     assert status == 0
     assert other["log_hash"] != first["log_hash"]
     _check_log(Path(first["log"]), first)
+    assert main(["replay", first["log"]]) == 0  # this process answers as the daemon did, to the bit
     assert (tmp_path / "a" / "flight.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -143,3 +146,11 @@ def test_ten_seeds_reach_and_ten_controls_collide(tmp_path: Path) -> None:
     assert [status for status, _ in reports] == [0] * 10
     controls = [demo(tmp_path / f"none{seed}", "--seed", str(seed), "--filter", "none")[1] for seed in range(10)]
     assert sum(report["collided"] for report in controls) >= 8
+
+
+def test_nobody_can_watch_a_lockstep_flight(tmp_path: Path) -> None:
+    words = ["demo", "--lockstep", "--watch", "--out", str(tmp_path / "x")]
+    command = [sys.executable, "-m", "companion.cli", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "--watch: expected without --lockstep" in done.stderr

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -162,3 +165,20 @@ def test_a_daemon_that_refuses_its_configuration_is_named(tmp_path: Path) -> Non
     assert done.returncode == 2
     assert "daemon of uav1" in done.stderr
     assert "horizont" in done.stderr
+
+
+def test_a_signal_before_the_flight_leaves_no_daemon_behind(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "sim_bridge.cli", "run", "--scenario", "empty", "--check", "--logs", str(tmp_path)]
+    child = subprocess.Popen(words, stdout=subprocess.DEVNULL, start_new_session=True)
+    try:
+        deadline = time.monotonic() + 30.0
+        while not (tmp_path / "uav1.log").exists() and time.monotonic() < deadline:  # its daemon is about to start
+            time.sleep(0.005)
+        time.sleep(0.05)
+        os.kill(child.pid, signal.SIGTERM)
+        assert child.wait(30.0) == 1
+        with pytest.raises(ProcessLookupError):  # nobody is left of its group
+            os.killpg(child.pid, 0)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)

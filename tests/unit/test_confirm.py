@@ -42,7 +42,8 @@ def confirmation(profile: str, mask: int, a: tuple[float, float, float] = (1.0, 
         ("px4", 0x0C3F, 0x0000, True),  # it flies to a position
         ("px4", 0x0C3F, 0x0DFF, True),
         ("crazyflie-sim", 0x0C3F, 0x0C3F, False),
-        ("crazyflie-sim", 0x0C3F, 0x083F, True),
+        ("crazyflie-sim", 0x0C3F, 0x003F, False),  # as PX4, the mask tells what is free and says nothing of the yaw
+        ("crazyflie-sim", 0x0C3F, 0x0DFF, True),
     ],
 )
 def test_masks_are_compared_where_the_autopilot_repeats_them(profile: str, sent: int, heard: int, wrong: bool) -> None:

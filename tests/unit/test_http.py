@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import doctest
 import logging
 import socket
 from collections.abc import AsyncIterator
@@ -12,6 +13,7 @@ import aiohttp
 import pytest
 from aiohttp import web
 
+import companion.http
 from companion.config import HttpConfig, config_hash, parse_config
 from companion.errors import ConfigError
 from companion.http import HttpServer
@@ -111,3 +113,7 @@ def test_commands_need_a_token_and_change_no_hash() -> None:
     with pytest.raises(ConfigError, match=r"http\.token_file: expected a file"):
         parse_config({"http": {"commands": True}})
     assert config_hash(parse_config({"http": {"enabled": False}})) == config_hash(parse_config({}))
+
+
+def test_the_example_of_the_docstring_holds() -> None:
+    assert doctest.testmod(companion.http) == (0, 1)

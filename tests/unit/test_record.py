@@ -121,7 +121,7 @@ def test_a_restart_keeps_the_logs_of_before(tmp_path: Path) -> None:
     assert [path.name for path in paths] == ["flight.mcap", "flight-1.mcap", "flight-2.mcap"]
     assert [ticks(path) for path in paths] == [[0], [1], [2]]
     with paths[0].open("rb") as file:
-        assert make_reader(file).get_summary().statistics.message_count == 2  # the configuration and the setpoint
+        assert make_reader(file).get_summary().statistics.message_count == 3  # configuration, metadata, setpoint
 
 
 def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> None:

@@ -161,6 +161,8 @@ def test_the_demo_is_what_it_says() -> None:
         ({"faults": [{**FAULT, "value": 1.0}]}, "faults[0]: value: expected none for drop"),
         ({"faults": [{**FAULT, "what": "gust", "on": "world", "value": 2.0}]}, "expected a wind [east, north, up]"),
         ({"faults": [{**FAULT, "what": "battery", "on": "autopilot", "value": 1.5}]}, "a state of charge, 0 to 1"),
+        ({"faults": [{**FAULT, "what": "clock_jump", "on": "autopilot", "value": 1.1e6}]}, "a jump in s other than 0"),
+        ({"faults": [{**FAULT, "expect": {"within_s": 1.0}}]}, "faults[0]: expect: expected state, verdict, mode or"),
         ({"faults": [{**FAULT, "vehicle": "b"}]}, "faults[0]: vehicle: expected one of uav1, got b"),
         ({"faults": [{**FAULT, "expect": {"state": "DONE"}}]}, "faults[0].expect.state: expected one of ACTIVE, FAULT"),
         ({"expect": {"never_state": ["NONE"]}}, "expect.never_state"),

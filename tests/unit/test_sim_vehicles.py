@@ -192,5 +192,7 @@ def test_parameters_of_the_scenario_reach_the_autopilot():
         assert [c.autopilot.parameters["COM_OF_LOSS_T"] for c in f.crafts] == [0.5, 1.0]
     finally:
         f.close()
+    with pytest.raises(ScenarioError, match=r"uav1: parameters.COM_OBL_RC_ACT: expected a value in its range, got 4.5"):
+        flight({"parameters": {"COM_OBL_RC_ACT": 4.5}}, {"start": [3.0, 0.0, 0.2]})
     with pytest.raises(ScenarioError, match=r"uav1: parameters: expected a parameter of px4, got NO_SUCH"):
         flight({"parameters": {"NO_SUCH": 1.0}}, {"start": [3.0, 0.0, 0.2]})

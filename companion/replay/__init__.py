@@ -1,0 +1,1 @@
+"""`companion replay`: the recorded calls again, through the brain of this version."""
