@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from companion.errors import ConfigError
+from companion.errors import CompanionError, ConfigError
 from companion.explain.facts import facts
 from companion.explain.moment import Outline, intervention, moment, outlines
 from companion.explain.words import paragraphs
@@ -48,6 +48,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def run(arguments: argparse.Namespace) -> int:
+    """Do it; a log that cannot be read is wrong usage, as a configuration is: status 1 means something else here."""
+    try:
+        return _run(arguments)
+    except CompanionError as error:
+        raise ConfigError(str(error)) from None
+
+
+def _run(arguments: argparse.Namespace) -> int:
     """Explain and print."""
     around = arguments.around
     if around is not None and not (math.isfinite(around) and around > 0.0):

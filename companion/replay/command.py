@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from companion.config import Config, apply_overrides, load_config, parse_config
-from companion.errors import ConfigError
+from companion.errors import CompanionError, ConfigError
 from companion.journal_format import Step
 from companion.logbook.reader import open_log
 from companion.numerics import this_machine
@@ -66,6 +66,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def run(arguments: argparse.Namespace) -> int:
+    """Do it; a log that cannot be read is wrong usage, as a configuration is: status 1 means something else here."""
+    try:
+        return _run(arguments)
+    except CompanionError as error:
+        raise ConfigError(str(error)) from None
+
+
+def _run(arguments: argparse.Namespace) -> int:
     """Replay and report."""
     if not (math.isfinite(arguments.tolerance) and arguments.tolerance >= 0.0):
         raise ConfigError(f"--tolerance: expected a number >= 0, got {arguments.tolerance:g}")
