@@ -11,11 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from docgen.commands import PARSERS
+from docgen.commands import commands as parsers
 from docs_blocks import RUN, SHOWN, Block, blocks, commands, inline_commands, pages
 from docs_session import ROOT, Session
-
-from tools.docgen.commands import PARSERS
-from tools.docgen.commands import commands as parsers
 
 PAGES = {str(page.relative_to(ROOT)): blocks(page) for page in pages()}
 ALL = [block for found in PAGES.values() for block in found]
