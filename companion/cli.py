@@ -42,6 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
     from companion.demo import command as demo
     from companion.doctor import command as doctor
     from companion.explain import command as explain
+    from companion.logbook import command as logbook
     from companion.replay import command as replay
 
     demo.add_parser(commands)
@@ -49,6 +50,7 @@ def build_parser() -> argparse.ArgumentParser:
     doctor.add_parser(commands)
     replay.add_parser(commands)
     explain.add_parser(commands)
+    logbook.add_parser(commands)
     bench.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")
     schema.add_argument("key", nargs="?", help="one key suffix, such as companion/setpoint; all where left out")

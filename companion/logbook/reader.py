@@ -14,7 +14,7 @@ from mcap.exceptions import InvalidMagic, McapError
 from mcap.records import Channel, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 
-from companion.config import Config
+from companion.config import Config, SafetyConfig
 from companion.errors import CompanionError
 
 CONFIG, METADATA = "/companion/config", "/companion/metadata"
@@ -98,6 +98,11 @@ class FlightLog:
             LogUnreadable: this version knows no such configuration.
         """
         return self.typed(self.configs[0])
+
+    @property
+    def drone_radius_m(self) -> float:
+        """Of the first configuration, whether or not this version understands the rest of it."""
+        return float(self.configs[0].values.get("safety", {}).get("drone_radius_m", SafetyConfig().drone_radius_m))
 
     def typed(self, entry: ConfigEntry) -> Config:
         """A configuration of the log as this version understands it; raises LogUnreadable as ``config``."""
