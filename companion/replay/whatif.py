@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from companion.commanded import acts_after_ns, at_action
 from companion.config import Config
 from companion.link.wire import SetpointRecord, TracksOut, decode
-from companion.pilot import Task, acts_after_ns, at_action
+from companion.pilot import Task
 from companion.replay.player import Played
 from companion.types import FloatArray, Vec3, VehicleState, frozen
 

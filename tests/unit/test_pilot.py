@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from companion.config import Config, parse_config
 from companion.errors import BrainFailure, PolicyOutputInvalid
 from companion.pilot import Pilot, PilotInput, PilotOutput, Task
+from companion.policy import artifact_folder
 from companion.types import (
     Detection,
     DetectionFrame,
@@ -347,3 +349,13 @@ def test_behind_a_slow_slew_it_arrives_and_stays(goal: list[float]) -> None:
         if k >= 250:
             farthest_m = max(farthest_m, float(np.linalg.norm(p - goal)))
     assert farthest_m < 0.05
+
+
+def test_a_pilot_names_its_artefact_and_a_law_of_your_own_has_none() -> None:
+    class Nothing:
+        def act(self, v_enu, error_enu):
+            return np.zeros(3)
+
+    folder = artifact_folder(Config().policy.artifact)
+    assert Pilot(Config()).artifact == hashlib.sha256((folder / "manifest.json").read_bytes()).hexdigest()
+    assert Pilot(Config(), Nothing()).artifact is None

@@ -226,6 +226,25 @@ def test_what_cannot_be_is_one_line(flown: Path, capsys, words: list[str], expec
     assert error.count("\n") == 1
 
 
+def test_a_file_that_is_no_log_is_wrong_usage(flown: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "notes.txt").write_text("hello", encoding="utf-8")
+    broken = rewritten(
+        flown,
+        tmp_path / "broken.mcap",
+        lambda of, count, body: {"call": "dance", "n": count} if of == "/companion/brain" and count == 9 else body,
+    )
+    for path, expected in (
+        (tmp_path / "notes.txt", "not an MCAP file"),
+        (tmp_path / "none.mcap", "cannot be read"),
+        (broken, "/companion/brain: Invalid value 'dance'"),
+    ):
+        for words in (["replay", str(path)], ["explain", str(path), "--worst"]):
+            assert main(words) == 2
+            error = capsys.readouterr().err
+            assert expected in error
+            assert error.count("\n") == 1
+
+
 def test_a_log_without_a_journal_is_one_line(flown: Path, tmp_path: Path, capsys) -> None:
     path = rewritten(flown, tmp_path / "old.mcap", lambda of, count, body: None if of == "/companion/brain" else body)
     assert main(["replay", str(path)]) == 2
