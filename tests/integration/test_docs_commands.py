@@ -6,7 +6,9 @@ import ast
 import json
 import re
 import shlex
+import sys
 import tomllib
+import types
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +17,9 @@ from docgen.commands import PARSERS
 from docgen.commands import commands as parsers
 from docs_blocks import RUN, SHOWN, Block, blocks, commands, inline_commands, pages
 from docs_session import ROOT, Session
+
+from companion.link.ingress import detections_from_frame
+from companion.link.wire import Obstacle, ObstacleFrame, decode
 
 PAGES = {str(page.relative_to(ROOT)): blocks(page) for page in pages()}
 ALL = [block for found in PAGES.values() for block in found]
@@ -107,6 +112,52 @@ def test_what_is_not_run_is_known() -> None:
     assert reasons <= REASONS, f"expected one of REASONS, got {reasons - REASONS}"
     left_out = sum("not run" in block.says for block in ALL)
     assert left_out < sum(block.runs for block in ALL), "more is left out than is run"
+
+
+def test_frames_of_the_examples_are_ones_that_the_daemon_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of every example that publishes, as many frames as it likes; a wrong field would be refused and never seen."""
+    examples = [block for block in ALL if block.language == "python" and "declare_publisher" in block.text]
+    assert len(examples) >= 2
+    for block in examples:
+        published: list[tuple[str, str]] = []
+        monkeypatch.setitem(sys.modules, "zenoh", _Zenoh(published))
+        monkeypatch.setattr("time.sleep", lambda seconds: None)
+        exec(compile(block.text, str(block), "exec"), {})
+        assert published, block
+        for key, payload in published:
+            assert key.startswith("uav/uav1/obstacles/")
+            frame = decode(payload.encode(), ObstacleFrame)
+            taken = detections_from_frame(
+                frame, source="s", sequence=0, now_ns=frame.stamp_ns, unix_minus_vehicle_ns=0, max_age_s=0.5
+            )
+            assert set(json.loads(payload)) <= {*ObstacleFrame.__struct_fields__}
+            assert {key for each in json.loads(payload)["obstacles"] for key in each} <= {*Obstacle.__struct_fields__}
+            assert taken.detections
+
+
+class _Zenoh(types.ModuleType):
+    """Stands for the module: one session, one publisher, which notes what is put."""
+
+    def __init__(self, published: list[tuple[str, str]]) -> None:
+        super().__init__("zenoh")
+        self._published, self._key = published, ""
+        self.Config = self.open = lambda *_: self
+
+    def insert_json5(self, key: str, value: str) -> None:
+        json.loads(value)
+
+    def declare_publisher(self, key: str) -> _Zenoh:
+        self._key = key
+        return self
+
+    def put(self, payload: str) -> None:
+        self._published.append((self._key, payload))
+
+    def __enter__(self) -> _Zenoh:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
 
 
 REASONS = {
