@@ -67,7 +67,7 @@ check: $(VENV)/dev.stamp  ## lint, format check, types
 	$(BIN)/mypy -p tools
 
 docs: $(VENV)/dev.stamp  ## make the reference pages from the code
-	$(BIN)/python -m tools.docgen
+	PYTHONPATH=docs $(BIN)/python -m docgen
 
 format: $(VENV)/dev.stamp  ## format the code
 	$(BIN)/ruff check --fix .

@@ -334,7 +334,7 @@ def apply_overrides(raw: dict[str, Any], overrides: tuple[str, ...]) -> dict[str
 
 
 def config_hash(config: Config) -> str:
-    """SHA-256 of the resolved configuration, but for what changes no flight: where files lie, who may watch, threads."""
+    """SHA-256 of the resolved configuration, but for what changes no flight: files, who may watch, threads."""
     values = msgspec.to_builtins(config)
     for section in ("log", "params", "http", "realtime"):
         values.pop(section)

@@ -117,11 +117,11 @@ class LogWriter:
             self._wake.clear()
             self._drain()
             self._guarded(self._keep)
-        self._drain()
+        self._drain()  # `put` takes nothing since `close`
         self._guarded(LogFiles.close)
 
     def _drain(self) -> None:
-        while self._queue:
+        for _ in range(len(self._queue)):  # what comes meanwhile waits for the flush that is due
             write, size = self._queue.popleft()
             if isinstance(write, threading.Event):  # somebody waits for a flush
                 self._guarded(LogFiles.flush)

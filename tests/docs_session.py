@@ -29,7 +29,7 @@ from sim_bridge.testing import free_port
 
 PORTS = {14540: socket.SOCK_DGRAM, 14550: socket.SOCK_DGRAM, 7447: socket.SOCK_STREAM, 7448: socket.SOCK_STREAM}
 PORTS[8080] = socket.SOCK_STREAM
-READ = ("tests", "policies", "docker", "deploy")  # folders of the checkout that pages name, beside configs
+READ = ("tests", "policies", "docker")  # folders of the checkout that pages name, beside configs
 WITHIN_S, SLOW_WITHIN_S = 60.0, 300.0  # for a block
 _SHIM = """\
 #!{python}

@@ -18,6 +18,7 @@ from companion.explain.words import paragraphs
 from companion.logbook.reader import open_log
 from companion.pilot import Task
 from companion.replay.moments import engaged_ns, moment_ns
+from companion.replay.progress import progress
 from companion.types import NS_PER_S
 
 WIDTH = 112
@@ -62,11 +63,13 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--around: expected seconds > 0, got {around:g}")
     log = open_log(arguments.log)
     origin_ns = engaged_ns(log)
-    ticks = outlines(log)
-    if not ticks:
-        raise ConfigError(f"{log.path}: no tick with an answer of the brain")
-    number = _worst(ticks) if arguments.worst else _nearest(ticks, moment_ns("--at", arguments.at, origin_ns), log.path)
-    found = facts(moment(log, number), ticks, intervention(ticks, number))
+    at_ns = None if arguments.worst else moment_ns("--at", arguments.at, origin_ns)
+    with progress(f"read {log.path.name}", quiet=arguments.json) as advance:
+        ticks = outlines(log, advance)
+        if not ticks:
+            raise ConfigError(f"{log.path}: no tick with an answer of the brain")
+        number = _worst(ticks) if at_ns is None else _nearest(ticks, at_ns, log.path)
+        found = facts(moment(log, number, advance), ticks, intervention(ticks, number))
     near = [] if around is None else _near(ticks, number, around)
     told = paragraphs(found, origin_ns)
     if arguments.json:

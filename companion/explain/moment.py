@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice
 
 from msgspec.structs import replace
 
@@ -17,6 +16,7 @@ from companion.logbook.reader import FlightLog
 from companion.pilot import PilotInput, Task
 from companion.replay.journal_reader import Entry, JournalReader
 from companion.replay.player import Player
+from companion.replay.progress import Advance
 from companion.replay.whatif import Commanded
 from companion.types import DetectionFrame, Prediction, Vec3, frozen
 
@@ -78,13 +78,18 @@ class Moment:
     prediction: Prediction | None  # of all confirmed tracks, as the brain had it
 
 
-def outlines(log: FlightLog) -> list[Outline]:
+def nothing() -> None:
+    """Stands for a progress display that nobody watches."""
+
+
+def outlines(log: FlightLog, on_tick: Advance = nothing) -> list[Outline]:
     """Every tick that the brain was asked for, in order."""
-    return [
-        _outline(entry.call, decode(entry.setpoint, SetpointRecord))
-        for entry in JournalReader(log).entries()
-        if isinstance(entry.call, Step) and entry.setpoint is not None
-    ]
+    found: list[Outline] = []
+    for entry in JournalReader(log).entries():
+        if isinstance(entry.call, Step) and entry.setpoint is not None:
+            on_tick()
+            found += [_outline(entry.call, decode(entry.setpoint, SetpointRecord))]
+    return found
 
 
 class _NoReference:
@@ -98,12 +103,13 @@ def _tracks_only(config: Config) -> Config:
     return replace(config, safety=replace(config.safety, filter="none"))
 
 
-def moment(log: FlightLog, number: int) -> Moment:
+def moment(log: FlightLog, number: int, on_tick: Advance = nothing) -> Moment:
     """The tick ``number`` of `outlines`. Raises ConfigError as `moments`, or where there is none."""
-    found = next(islice(moments(log), number, None), None)
-    if found is None:
-        raise ConfigError(f"{log.path}: expected a tick {number}, it is not there")
-    return found
+    for count, found in enumerate(moments(log)):
+        on_tick()
+        if count == number:
+            return found
+    raise ConfigError(f"{log.path}: expected a tick {number}, it is not there")
 
 
 def moments(log: FlightLog) -> Iterator[Moment]:

@@ -2,7 +2,7 @@
 
 rmw_zenoh publishes a topic on ``<domain>/<topic without outer slashes>/<pkg::msg::dds_::Type_>/<type hash>``: inner
 slashes stay (only its liveliness tokens turn them into ``%``), the payload is CDR behind a 4-byte header, an attachment
-has sequence number, time and publisher, of which nothing is needed here. Source: ros2/rmw_zenoh, docs/reference/ros2.md.
+has sequence number, time and publisher, of which nothing is needed here. Source: design of ros2/rmw_zenoh.
 
 The door subscribes with ``*`` in the place of the hash, so that a message of another layout is seen and told, and
 decodes what has the hash of the layout it knows, one named in ``ros2.type_hashes``, or Humble's place holder.

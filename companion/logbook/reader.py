@@ -15,7 +15,7 @@ from mcap.records import Channel, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 
 from companion.config import Config, SafetyConfig
-from companion.errors import CompanionError
+from companion.errors import ConfigError
 
 CONFIG, METADATA = "/companion/config", "/companion/metadata"
 NEXT = "companion.next"
@@ -24,7 +24,7 @@ MAX_RECORD_BYTES = 1 << 28  # a damaged length must not fill the memory
 _DAMAGE = (McapError, CRCValidationError, struct.error, UnicodeDecodeError, ValueError, KeyError, OverflowError)
 
 
-class LogUnreadable(CompanionError):
+class LogUnreadable(ConfigError):
     """A file that is no log of ours; the line names it."""
 
 
@@ -50,10 +50,17 @@ class ConfigEntry:
     values: dict[str, Any]
 
 
+class _Head(msgspec.Struct):
+    version: str
+    hash: str
+    config: dict[str, Any]
+
+
 class FlightLog:
     """A log; every query reads the files from front to back and holds no more than one chunk of them.
 
-    ``paths``: its parts. ``cut``: why the last part ends early (the writer was killed, or its disk was full), or None.
+    Once the whole of it has been read, ``paths`` are its parts, and ``cut`` tells why the last one ends early (the
+    writer was killed, or its disk was full), None where it does not.
     """
 
     def __init__(self, path: Path) -> None:
@@ -84,8 +91,11 @@ class FlightLog:
         """Every configuration that was flown, in order; more than one where live parameters or the profile changed."""
         entries: list[ConfigEntry] = []
         for message in self.messages(CONFIG):
-            told = message.json
-            entry = ConfigEntry(message.stamp_ns, told["version"], told["hash"], told["config"])
+            try:
+                head = msgspec.json.decode(message.data, type=_Head)
+            except msgspec.DecodeError as error:
+                raise LogUnreadable(f"{self.path}: {CONFIG}: {error}") from None
+            entry = ConfigEntry(message.stamp_ns, head.version, head.hash, head.config)
             if not entries or entry != entries[-1]:  # each part begins with the one that holds
                 entries.append(entry)
         return tuple(entries)
@@ -116,18 +126,20 @@ class FlightLog:
     def messages(self, *topics: str) -> Iterator[LogMessage]:
         """Messages of ``topics``, of all where none is named, in the order in which they were written."""
         known: list[Path] = []
+        damage: list[str] = []
         following: Path | None = self.path
-        self.cut = None
         while following is not None and following not in known and (following == self.path or following.exists()):
             known.append(following)
-            following = yield from self._of_part(following, frozenset(topics))
-        self.paths = tuple(known)
+            following = yield from self._of_part(following, frozenset(topics), damage)
+        self.paths, self.cut = tuple(known), damage[-1] if damage else None
 
-    def _of_part(self, path: Path, topics: frozenset[str]) -> Generator[LogMessage, None, Path | None]:
+    def _of_part(
+        self, path: Path, topics: frozenset[str], damage: list[str]
+    ) -> Generator[LogMessage, None, Path | None]:
         """The messages of one part; its return value is the part after it."""
         channels: dict[int, str] = {}
         following: Path | None = None
-        for record in self._records(path):
+        for record in self._records(path, damage):
             if isinstance(record, Message):
                 topic = channels.get(record.channel_id, "")
                 if not topics or topic in topics:
@@ -138,7 +150,9 @@ class FlightLog:
                 following = path.with_name(Path(record.metadata["file"]).name)
         return following
 
-    def _records(self, path: Path) -> Iterator[McapRecord]:
+    @staticmethod
+    def _records(path: Path, damage: list[str]) -> Iterator[McapRecord]:
+        """The records up to the end, or to where it ends early; ``damage`` then gets why."""
         try:
             with path.open("rb") as file:
                 reader = StreamReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES)
@@ -146,9 +160,9 @@ class FlightLog:
         except OSError as error:
             raise LogUnreadable(f"{path}: cannot be read ({error.strerror}), expected an MCAP file") from None
         except InvalidMagic:
-            self.cut = "its end is missing or damaged"
+            damage.append("its end is missing or damaged")
         except _DAMAGE as error:
-            self.cut = f"it ends early ({type(error).__name__}: {error})" if str(error) else "it ends early"
+            damage.append(f"it ends early ({error})" if str(error) else "it ends early")
 
     def _head(self) -> None:
         """Read as far as the configuration, which every log of ours begins with."""
@@ -160,8 +174,8 @@ class FlightLog:
         if magic != b"\x89MCAP0\r\n":
             raise LogUnreadable(f"{self.path}: not an MCAP file, expected the log of a flight (flight.mcap)")
         if next(self.messages(CONFIG), None) is None:
-            what = "nothing of a flight was written" if self.cut else "written by something else"
-            raise LogUnreadable(f"{self.path}: no message on {CONFIG}: {what}, expected the log of a flight")
+            what = "cut before anything of a flight was written" if self.cut else "written by something else"
+            raise LogUnreadable(f"{self.path}: no message on {CONFIG} ({what}), expected the log of a flight")
 
 
 def open_log(path: Path) -> FlightLog:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from companion.replay.compare import Comparison
 from companion.replay.journal_reader import JournalReader
 from companion.replay.moments import engaged_ns, moment_ns
 from companion.replay.player import Played, Player, Variant, seconds
+from companion.replay.progress import Advance, progress
 from companion.replay.whatif import Commanded, WhatIf, as_json, judge
 
 _EPILOG = """\
@@ -83,7 +82,7 @@ def _run(arguments: argparse.Namespace) -> int:
     end_ns = None if arguments.end is None else moment_ns("--to", arguments.end, origin_ns)
     variant = _variant(arguments)
     player = Player(JournalReader(log), variant=variant, artifact=arguments.artifact)
-    with _progress(log.path, quiet=arguments.json) as advance:
+    with progress(f"replay {log.path.name}", quiet=arguments.json) as advance:
         ticks = _told(player.ticks(end_ns), advance)
         window = (begin_ns, end_ns)
         if variant is None:
@@ -224,20 +223,7 @@ def _vector(values: tuple[float, ...]) -> str:
     return "(" + ", ".join(f"{value:.2f}" for value in values) + ")"
 
 
-def _told(ticks: Iterator[Played], advance: Any) -> Iterator[Played]:
+def _told(ticks: Iterator[Played], advance: Advance) -> Iterator[Played]:
     for played in ticks:
         advance()
         yield played
-
-
-@contextmanager
-def _progress(path: Path, *, quiet: bool) -> Iterator[Any]:
-    """A count of ticks on a terminal, gone at the end; nothing elsewhere."""
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    live = sys.stderr.isatty() and not quiet
-    columns = (SpinnerColumn(), TextColumn("{task.description}: {task.completed:.0f} ticks"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not live) as progress:
-        task = progress.add_task(f"replay {path.name}", total=None)
-        yield lambda: progress.advance(task)

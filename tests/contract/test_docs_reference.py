@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 
 import pytest
-
-from tools.docgen import __main__ as docgen
-from tools.docgen import configuration, mavlink, pages
-from tools.docgen.commands import PARSERS
-from tools.docgen.commands import commands as parsers
+from docgen import __main__ as docgen
+from docgen import configuration, mavlink, pages
+from docgen.commands import PARSERS
+from docgen.commands import commands as parsers
 
 
 def test_no_page_is_stale() -> None:

@@ -13,13 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from docgen.commands import PARSERS
+from docgen.commands import commands as parsers
 from docs_blocks import RUN, SHOWN, Block, blocks, commands, inline_commands, pages
 from docs_session import ROOT, Session
 
 from companion.link.ingress import detections_from_frame
 from companion.link.wire import Obstacle, ObstacleFrame, decode
-from tools.docgen.commands import PARSERS
-from tools.docgen.commands import commands as parsers
 
 PAGES = {str(page.relative_to(ROOT)): blocks(page) for page in pages()}
 ALL = [block for found in PAGES.values() for block in found]

@@ -12,7 +12,7 @@ from docs_blocks import ROOT, pages, text_of
 _LINK = re.compile(r"!?\[(?:[^\]\[]|\[[^\]]*\])*\]\(([^)\s]+)\)")
 _FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 _CODE = re.compile(r"`[^`\n]*`(?!\])")
-_NAMED = re.compile(r"\b(?:docs|configs|docker|deploy)/[\w./-]+\.(?:md|toml|json5|png|gif|yaml|service|rules)\b")
+_NAMED = re.compile(r"\b(?:docs|configs|docker)/[\w./-]+\.(?:md|toml|json5|png|gif|yaml|service|rules)\b")
 
 
 def links(page: Path) -> list[str]:

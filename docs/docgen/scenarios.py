@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from docgen.pages import table
+from docgen.structs import Struct, fields_of, tables_in
 from sim_bridge.scenario import Scenario, load_scenario, scenario_names
 from sim_bridge.scenario_faults import Fault
 from sim_bridge.scenario_obstacles import _Placed
-from tools.docgen.pages import table
-from tools.docgen.structs import Struct, fields_of, tables_in
 
 
 def tables() -> str:

@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterator
 
 from companion.cli import build_parser as companion_parser
+from docgen.pages import table
 from policies.cli import _parser as policies_parser
 from sim_bridge.cli import _parser as sim_bridge_parser
-from tools.docgen.pages import table
 
 PARSERS = {"companion": companion_parser, "sim-bridge": sim_bridge_parser, "policies": policies_parser}
 

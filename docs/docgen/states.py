@@ -8,7 +8,7 @@ import re
 from companion.profiles import PROFILES
 from companion.state import TABLE, Event, Rule, State
 from companion.types import Verdict
-from tools.docgen.pages import table
+from docgen.pages import table
 
 _RULES = {Rule.STAY: ".", Rule.SETTLE: "settle"}
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import msgspec
 
 from companion.config import PRESETS, Config
-from tools.docgen.pages import table
-from tools.docgen.structs import Field, Struct, fields_of, tables_in
+from docgen.pages import table
+from docgen.structs import Field, Struct, fields_of, tables_in
 
 DEFAULT_FILE = Path(__file__).parents[2] / "configs" / "default.toml"
 _SECTION = re.compile(r"^\[(?P<name>[\w.]+)\]\s*(?:#\s*(?P<comment>.*))?$")

@@ -1,4 +1,4 @@
-"""`python -m tools.docgen`: make the reference anew; with ``--check`` only say what is stale (exit status 1)."""
+"""`python -m docgen`: make the reference anew; with ``--check`` only say what is stale (exit status 1)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from companion import tunables
 from companion.link.keys import key_page
 from companion.prometheus import metrics_page
-from tools.docgen import commands, configuration, mavlink, pages, scenarios, states
+from docgen import commands, configuration, mavlink, pages, scenarios, states
 
 DOCS = Path(__file__).parents[2] / "docs"
 MAKERS: dict[str, pages.Maker] = {
@@ -33,7 +33,7 @@ WHOLE: dict[str, pages.Maker] = {"reference/keys.md": key_page, "reference/metri
 
 def main(argv: list[str] | None = None) -> int:
     """Write what is stale, or only name it."""
-    parser = argparse.ArgumentParser(prog="python -m tools.docgen", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m docgen", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; exit status 1 if a page is stale")
     arguments = parser.parse_args(argv)
     found = pages.stale(DOCS, MAKERS, WHOLE)

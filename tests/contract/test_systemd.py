@@ -14,7 +14,7 @@ import pytest
 from companion.cli import build_parser
 from companion.health import BEAT_LIMIT_S
 
-DEPLOY = Path(__file__).parents[2] / "deploy"
+DEPLOY = Path(__file__).parents[2] / "configs" / "systemd"
 UNIT = (DEPLOY / "companion.service").read_text(encoding="utf-8")
 ANALYZE = shutil.which("systemd-analyze")
 

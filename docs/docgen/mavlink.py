@@ -17,7 +17,7 @@ from companion import microservices
 from companion.link import mav, params
 from companion.link.decode import DECODERS
 from companion.link.decode_traffic import TRAFFIC_DECODERS
-from tools.docgen.pages import table
+from docgen.pages import table
 
 _PACKAGE = Path(companion.__file__).parent
 _BUILT = re.compile(r"MAVLink_(\w+)_message\(")

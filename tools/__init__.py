@@ -1,1 +1,0 @@
-"""What the project is made with, not shipped with it."""
