@@ -30,7 +30,7 @@ from sim_bridge.testing import free_port
 PORTS = {14540: socket.SOCK_DGRAM, 14550: socket.SOCK_DGRAM, 7447: socket.SOCK_STREAM, 7448: socket.SOCK_STREAM}
 PORTS[8080] = socket.SOCK_STREAM
 READ = ("tests", "policies", "docker")  # folders of the checkout that pages name, beside configs
-WITHIN_S = 60.0
+WITHIN_S, SLOW_WITHIN_S = 60.0, 300.0  # for a block
 _SHIM = """\
 #!{python}
 import sys
@@ -86,7 +86,8 @@ class Session:
             command = [sys.executable, "-c", text]
         else:
             command = ["bash", "-euo", "pipefail", "-c", text]
-        running = Running(command, self.folder, self._environment, str(block))
+        within_s = SLOW_WITHIN_S if "slow" in block.says else WITHIN_S
+        running = Running(command, self.folder, self._environment, str(block), within_s)
         if "until" in block.says or "beside" in block.says:
             self._behind.append(running)
             if until := block.says.get("until"):
@@ -108,8 +109,10 @@ class Session:
 class Running:
     """One block as a process group, its output read line by line."""
 
-    def __init__(self, command: list[str], folder: Path, environment: dict[str, str], name: str) -> None:
-        self.name, self.said = name, ""
+    def __init__(
+        self, command: list[str], folder: Path, environment: dict[str, str], name: str, within_s: float
+    ) -> None:
+        self.name, self.said, self._within_s = name, "", within_s
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._process = subprocess.Popen(
             command,
@@ -148,13 +151,14 @@ class Running:
         assert got in (0, 130, -signal.SIGINT), f"{self.name}: exit status {got} after Ctrl-C:\n{self.said}"
 
     def _until_end(self) -> Iterator[None]:
-        deadline = time.monotonic() + WITHIN_S
+        deadline = time.monotonic() + self._within_s
         while True:
             try:
                 line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
                 self._signal(signal.SIGKILL)
-                raise AssertionError(f"{self.name}: nothing came of it in {WITHIN_S:g} s:\n{self.said}") from None
+                self._process.wait()
+                raise AssertionError(f"{self.name}: nothing came of it in {self._within_s:g} s:\n{self.said}") from None
             if line is None:
                 return
             self.said += line
