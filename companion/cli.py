@@ -41,10 +41,12 @@ def build_parser() -> argparse.ArgumentParser:
     from companion.bench import command as bench
     from companion.demo import command as demo
     from companion.doctor import command as doctor
+    from companion.logbook import command as logbook
 
     demo.add_parser(commands)
     publish.add_parser(commands)
     doctor.add_parser(commands)
+    logbook.add_parser(commands)
     bench.add_parser(commands)
     schema = commands.add_parser("schema", help="print the JSON Schema of every Zenoh payload")
     schema.add_argument("key", nargs="?", help="one key suffix, such as companion/setpoint; all where left out")

@@ -152,6 +152,11 @@ class ParamsConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 class LogConfig(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):
     directory: str | None = None  # None: no log
+    max_mb: Annotated[float, Meta(ge=1.0, le=1e6)] = 512.0  # of one file; a longer flight goes on in the next
+    keep_mb: Annotated[float, Meta(ge=1.0, le=1e8)] = 4096.0  # of all flights in the folder; the oldest are removed
+    keep_files: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
+    tlog: bool = True  # every MAVLink packet in flight.tlog beside it, for QGroundControl and mavlogdump
+    scene_hz: Annotated[float, Meta(ge=0.0, le=100.0)] = 10.0  # pictures for Foxglove; 0: none
 
 
 class Config(Section, frozen=True, kw_only=True, forbid_unknown_fields=True):

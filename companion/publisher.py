@@ -14,6 +14,7 @@ from companion.metrics import TickMeter
 from companion.pilot import PilotOutput
 from companion.record import Recorder
 from companion.report import FlightHash, tracks_out, vehicle_out
+from companion.scene_log import SceneLog
 from companion.session import VehicleSession
 from companion.state import State
 from companion.tracking.agility import AGILE
@@ -22,21 +23,25 @@ from companion.types import NS_PER_S, DetectionFrame, TrackTable, Vec3, VehicleS
 log = logging.getLogger("companion")
 
 STATUS_NS = NS_PER_S // 5
-FLUSH_NS = NS_PER_S
 
 
 class Publisher:
     """Publishes and logs; the record goes out first, because in lockstep the simulator waits for it."""
 
-    def __init__(self, zenoh: ZenohLink, recorder: Recorder | None) -> None:
+    def __init__(self, zenoh: ZenohLink, recorder: Recorder | None, scenes: SceneLog | None = None) -> None:
         self._zenoh = zenoh
+        self._scenes = scenes
         self._recorder = recorder
         self._hash = FlightHash()
         self._verdict = "silent"
         self._tracks = 0
         self._agile: list[str] = []
-        self._flushed_ns = 0
         self._last: tuple[int, object] | None = None
+
+    @property
+    def log_counts(self) -> dict[str, int]:
+        """Messages that did not get into the log; empty without one."""
+        return {} if self._recorder is None else dict(self._recorder.counts)
 
     @property
     def log_hash(self) -> str:
@@ -50,8 +55,13 @@ class Publisher:
         frames: tuple[DetectionFrame, ...],
         output: PilotOutput | None,
         tracks: Callable[[], TrackTable],
+        arrived_unix_ns: int | None = None,
+        target_enu: Vec3 | None = None,
     ) -> None:
-        """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left."""
+        """One tick's record, vehicle and tracks; ``tracks`` is asked after the record has left.
+
+        ``arrived_unix_ns``: when the vehicle state came.
+        """
         self._verdict = record.verdict
         payload = wire.encode(record)
         self._zenoh.put_encoded("companion/setpoint", payload)
@@ -61,35 +71,37 @@ class Publisher:
         if self._recorder is not None:
             self._recorder.frames(frames, vehicle.stamp_ns)
             self._recorder.message("/companion/setpoint", vehicle.stamp_ns, payload)
-        self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle))
+        self._offer("companion/vehicle", vehicle.stamp_ns, lambda: vehicle_out(vehicle, arrived_unix_ns))
         if output is not None:
             self._offer("companion/tracks", vehicle.stamp_ns, lambda: tracks_out(output, table))
+        if self._scenes is not None:
+            self._scenes.tick(record, vehicle, output, table, target_enu)
         self._hash.tick(state, vehicle, frames, output, table)
 
     def _offer(self, key: str, stamp_ns: int, build: Callable[[], msgspec.Struct]) -> None:
         """Build and encode once for whoever wants it: subscribers, the log, or nobody."""
         wanted = self._zenoh.wanted(key)
-        if not wanted and self._recorder is None:
-            return
-        payload = wire.encode(build())
         if wanted:
+            payload = wire.encode(build())
             self._zenoh.put_encoded(key, payload)
-        if self._recorder is not None:
-            self._recorder.message(f"/{key}", stamp_ns, payload)
+            if self._recorder is not None:
+                self._recorder.message(f"/{key}", stamp_ns, payload)
+        elif self._recorder is not None:
+            self._recorder.later(f"/{key}", stamp_ns, build)
 
     def configured(self, config: Config, stamp_ns: int) -> None:
         """The profile is settled, or live parameters changed: the log says what holds from here on."""
         if self._recorder is not None:
             self._recorder.config(config, stamp_ns)
+        if self._scenes is not None:
+            self._scenes.configured(config)
 
-    def keep_log(self, now_ns: int) -> str | None:
-        """Flush the log once a second; why it is not written any more, or None."""
+    def keep_log(self) -> str | None:
+        """The tick is over: let the log be written. What has befallen it since the last call, or None."""
         if self._recorder is None:
             return None
-        if now_ns - self._flushed_ns >= FLUSH_NS:
-            self._flushed_ns = now_ns
-            self._recorder.flush()
-        return self._recorder.failure
+        self._recorder.kick()
+        return self._recorder.trouble()
 
     def status(
         self,

@@ -1,126 +1,188 @@
-"""The log of a flight: an MCAP file of JSON messages with named JSON Schemas, which Foxglove and `mcap` open.
+"""What the log of a flight holds: JSON messages with named JSON Schemas in MCAP, which Foxglove and `mcap` open.
 
-Topics: ``/companion/config`` (resolved configuration, its hash and version: first, and again when live parameters
-change), ``/companion/input/obstacles`` (frames as the brain consumed them, vehicle clock, ENU),
-``/companion/vehicle``, ``/companion/setpoint``, ``/companion/tracks``, ``/companion/status``. Times are nanoseconds
-of the vehicle's clock.
+Topics: ``/companion/metadata`` (versions, artefact) and ``/companion/config`` (resolved configuration, its hash and
+version: first, and again when live parameters change), ``/companion/input/obstacles`` (frames as the brain consumed
+them, vehicle clock, ENU, with their arrival), ``/companion/vehicle``, ``/companion/setpoint``, ``/companion/tracks``,
+``/companion/status``, ``/companion/texts`` (STATUSTEXT as sent). Times are nanoseconds of the vehicle's clock; arrivals
+are those of this computer's unix clock. Beside it lies a tlog of every MAVLink packet.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-from io import BufferedWriter
+from collections import Counter
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
-from mcap.writer import CompressionType, Writer
 
-from companion import __version__
+from companion import __version__, foxglove
+from companion.clock import Clock, SystemClock
 from companion.config import Config, config_hash
 from companion.errors import ConfigError
-from companion.link.wire import OUTGOING, ObstacleFrame
+from companion.link.wire import OUTGOING, ObstacleFrame, encode
+from companion.log_files import Limits, LogFiles
+from companion.log_writer import LogWriter
+from companion.provenance import Provenance, provenance
+from companion.tlog import is_secret
 from companion.types import DetectionFrame
 
-CHUNK_BYTES = 65536  # what the writer holds back between two flushes at most
+CONFIG, METADATA, OBSTACLES = "/companion/config", "/companion/metadata", "/companion/input/obstacles"
+TEXTS = "/companion/texts"
+MB = 1_000_000
+
+Message: TypeAlias = tuple[str, int, bytes]  # topic, stamp, payload
 
 _ENCODER = msgspec.json.Encoder()
 
 
-class Recorder:
-    """Appends a flight to one file, the first of ``flight.mcap``, ``flight-1.mcap``, ... that does not exist yet.
+class TextOut(msgspec.Struct, frozen=True, kw_only=True):
+    """``/companion/texts``: a STATUSTEXT as it was sent; ``severity`` is a MAV_SEVERITY."""
 
-    ``flush``, called once a second, hands all that was appended to the system: a daemon that is killed loses no more
-    than that second, and the file still reads from front to back. ``close`` writes the index. A disk that fails ends
-    the log and not the flight: after the first OSError nothing is written any more and ``failure`` tells why.
+    stamp_ns: int
+    severity: int
+    text: str
+
+
+class Recorder:
+    """The log of one flight. Appending never blocks (but in lockstep, where nothing is dropped) and never raises.
+
+    A daemon that is killed loses no more than the last second, and the file still reads from front to back. After the
+    first OSError nothing is written any more and ``failure`` tells why. ``counts``: as `LogWriter`.
 
     Raises:
-        ConfigError: the file cannot be created (the constructor only; nothing else raises).
+        ConfigError: the file cannot be created (the constructor only).
     """
 
-    def __init__(self, path: Path, config: Config) -> None:
+    def __init__(self, path: Path, config: Config, clock: Clock | None = None) -> None:
+        log, started_unix_ns = config.log, (clock or SystemClock()).unix_ns()
+        limits = Limits(round(log.max_mb * MB), round(log.keep_mb * MB), log.keep_files)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = _create(path)
+            self._files = LogFiles(path, limits, tlog=log.tlog)
         except OSError as error:
             raise ConfigError(f"log.directory: {path.parent}: cannot write there ({error.strerror})") from None
-        self.path = Path(self._file.name)
-        self.failure: str | None = None
-        self._open = True
-        self._writer: Any = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
-        self._channels: dict[str, int] = {}
+        self._told: set[str] = set()
+        self._writer = LogWriter(self._files, lossless=config.sync == "lockstep")
         try:
-            self._start()
+            self._files.start()
+            self._declare_own()
         except OSError as error:
-            self._fail(error)
+            self._writer.fail(error)
+        self._writer.start()
         self.config(config, 0)
-        self.flush()
+        self._writer.put(partial(_add_provenance, config=config, unix_ns=started_unix_ns), 0)
+
+    @property
+    def path(self) -> Path:
+        """The first file of this flight."""
+        return self._files.path
+
+    @property
+    def failure(self) -> str | None:
+        """Why nothing is written any more."""
+        return self._writer.failure
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Messages that did not get into the log: dropped, lost, broken (as `LogWriter`)."""
+        return self._writer.counts
+
+    def trouble(self) -> str | None:
+        """What has befallen the log and was not told yet: it ended, or the first messages were dropped."""
+        if self.failure is not None and "failure" not in self._told:
+            self._told.add("failure")
+            return f"{self.failure}; flying on without it"
+        if self.counts["dropped"] and "dropped" not in self._told:
+            self._told.add("dropped")
+            return f"{self.path}: the disk does not keep up, the log has gaps"
+        return None
+
+    def declare(self, topic: str, name: str, schema: dict[str, Any]) -> None:
+        """A topic of another module and the JSON Schema of its messages; before its first message."""
+        self._writer.put(partial(LogFiles.declare, topic=topic, name=name, schema=_schema(schema)), 0)
+
+    def message(self, topic: str, stamp_ns: int, payload: bytes) -> None:
+        """Append one JSON message."""
+        self._writer.put(lambda files: files.add(topic, stamp_ns, payload), len(payload))
+
+    def later(self, topic: str, stamp_ns: int, build: Callable[[], msgspec.Struct], size: int = 1024) -> None:
+        """Append the message that ``build`` makes of frozen values, on the writer's thread.
+
+        ``size`` is about what it holds on to until then [bytes].
+        """
+        self._writer.put(lambda files: files.add(topic, stamp_ns, encode(build())), size)
+
+    def batch(self, build: Callable[[], Iterable[Message]], size: int) -> None:
+        """Append what ``build`` makes of frozen values: topic, stamp and payload of each; as `later`."""
+        self._writer.put(lambda files: _add_all(files, build()), size)
+
+    def text(self, stamp_ns: int, severity: int, text: str) -> None:
+        """Append a STATUSTEXT as it was sent; ``severity`` is a MAV_SEVERITY."""
+        self.later(TEXTS, stamp_ns, lambda: TextOut(stamp_ns=stamp_ns, severity=severity, text=text))
+        self.later("/foxglove/log", stamp_ns, lambda: foxglove.log_of(stamp_ns, severity, text, "companion"))
 
     def config(self, config: Config, stamp_ns: int) -> None:
         """Append the resolved configuration that holds from here on."""
         head = {"version": __version__, "hash": config_hash(config), "config": msgspec.to_builtins(config)}
-        self.message("/companion/config", stamp_ns, _ENCODER.encode(head))
-
-    def message(self, topic: str, stamp_ns: int, payload: bytes) -> None:
-        """Append one JSON message."""
-        if not self._open:
-            return
-        try:
-            self._writer.add_message(self._channels[topic], log_time=stamp_ns, data=payload, publish_time=stamp_ns)
-        except OSError as error:
-            self._fail(error)
+        payload = _ENCODER.encode(head)
+        self._writer.put(lambda files: files.standing(CONFIG, stamp_ns, payload), len(payload))
 
     def frames(self, frames: tuple[DetectionFrame, ...], tick_ns: int) -> None:
         """Append the obstacle frames that a tick consumed."""
         for frame in frames:
-            self.message("/companion/input/obstacles", tick_ns, _ENCODER.encode(_frame_json(frame)))
+            self._writer.put(partial(_add_frame, frame=frame, tick_ns=tick_ns), 200 * len(frame.detections))
+
+    def packet(self, raw: bytes, unix_us: int, outgoing: bool) -> None:
+        """Append one MAVLink packet, as it was on the wire, to the tlog."""
+        if not is_secret(raw):
+            self._writer.put(lambda files: files.packet(unix_us, raw), len(raw))
+
+    def kick(self) -> None:
+        """A tick is over: now is a good time to write."""
+        self._writer.kick()
 
     def flush(self) -> None:
-        """Write the chunk in progress and hand it to the system, which keeps it when this process is killed."""
-        if not self._open:
-            return
-        try:
-            self._writer.flush()
-        except OSError as error:
-            self._fail(error)
+        """Wait until all that was appended is with the system. Not for the control path."""
+        self._writer.flush()
 
     def close(self) -> None:
-        """Write the index; appending afterwards does nothing."""
-        if not self._open:
-            return
-        try:
-            self._writer.finish()
-            self._file.close()
-        except OSError as error:
-            self._fail(error)
-        self._open = False
+        """Write what waits and the index, end the thread; appending afterwards does nothing."""
+        self._writer.close()
 
-    def _fail(self, error: OSError) -> None:
-        self.failure = f"{self.path}: the log ends here ({error.strerror or error})"
-        self._open = False
-        with contextlib.suppress(OSError):  # closing writes what is still buffered, and fails as the write did
-            self._file.close()
-
-    def _start(self) -> None:
-        self._writer.start(profile="", library=f"companion {__version__}")
+    def _declare_own(self) -> None:
         for suffix in ("companion/vehicle", "companion/setpoint", "companion/tracks", "companion/status"):
-            self._register(f"/{suffix}", OUTGOING[suffix].__name__, msgspec.json.schema(OUTGOING[suffix]))
-        self._register("/companion/input/obstacles", "ObstacleFrame", msgspec.json.schema(ObstacleFrame))
-        self._register("/companion/config", "Config", {"type": "object"})
+            kind = OUTGOING[suffix]
+            self._files.declare(f"/{suffix}", kind.__name__, _schema(msgspec.json.schema(kind)))
+        self._files.declare(OBSTACLES, "ObstacleFrame", _schema(msgspec.json.schema(ObstacleFrame)))
+        self._files.declare(CONFIG, "Config", b'{"type":"object"}')
+        for topic, record in ((METADATA, Provenance), (TEXTS, TextOut)):
+            self._files.declare(topic, record.__name__, _schema(msgspec.json.schema(record)))
+        for topic, drawn in foxglove.TOPICS.items():
+            name, schema = foxglove.schema_of(drawn)
+            self._files.declare(topic, name, _schema(schema))
 
-    def _register(self, topic: str, name: str, schema: dict[str, Any]) -> None:
-        schema_id = self._writer.register_schema(name=name, encoding="jsonschema", data=_ENCODER.encode(schema))
-        self._channels[topic] = self._writer.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
+
+def _schema(schema: dict[str, Any]) -> bytes:
+    return _ENCODER.encode(foxglove.inlined(schema))
 
 
-def _create(path: Path) -> BufferedWriter:
-    """A new file: a daemon that was restarted must not destroy the log of what came before."""
-    for number in itertools.count():
-        name = path if number == 0 else path.with_stem(f"{path.stem}-{number}")
-        with contextlib.suppress(FileExistsError):
-            return name.open("xb")
-    raise AssertionError("itertools.count ends")
+def _add_provenance(files: LogFiles, *, config: Config, unix_ns: int) -> None:
+    told = provenance(config, unix_ns)
+    values = msgspec.to_builtins(told)
+    packages = values.pop("packages")
+    files.describe({key: str(value) for key, value in (values | packages).items() if value is not None})
+    files.standing(METADATA, 0, encode(told))
+
+
+def _add_all(files: LogFiles, messages: Iterable[Message]) -> None:
+    for topic, stamp_ns, payload in messages:
+        files.add(topic, stamp_ns, payload)
+
+
+def _add_frame(files: LogFiles, *, frame: DetectionFrame, tick_ns: int) -> None:
+    files.add(OBSTACLES, tick_ns, _ENCODER.encode(_frame_json(frame)))
 
 
 def _frame_json(frame: DetectionFrame) -> dict[str, Any]:
@@ -131,6 +193,7 @@ def _frame_json(frame: DetectionFrame) -> dict[str, Any]:
         "source": frame.source,
         "sequence": frame.sequence,
         "kind": frame.kind.value,
+        "arrived_unix_ns": frame.arrived_unix_ns,
         "obstacles": [
             {
                 "id": seen.id,

@@ -41,10 +41,11 @@ def setpoint_record(
         disturbance=(0.0, 0.0, 0.0) if output is None else _vec(output.disturbance),
         tracks=0 if output is None else len(output.prediction),
         timings_ms=dict(timings_ms),
+        detour=result is not None and result.detour,
     )
 
 
-def vehicle_out(vehicle: VehicleState) -> VehicleOut:
+def vehicle_out(vehicle: VehicleState, arrived_unix_ns: int | None = None) -> VehicleOut:
     w, x, y, z = vehicle.q_enu_from_flu.tolist()
     return VehicleOut(
         stamp_ns=vehicle.stamp_ns,
@@ -52,6 +53,7 @@ def vehicle_out(vehicle: VehicleState) -> VehicleOut:
         velocity=_vec(vehicle.v_enu),
         attitude=(w, x, y, z),
         reset_counter=vehicle.reset_counter,
+        arrived_unix_ns=arrived_unix_ns,
     )
 
 

@@ -35,6 +35,7 @@ from companion.publisher import Publisher
 from companion.record import Recorder
 from companion.report import setpoint_record
 from companion.route import Route
+from companion.scene_log import SceneLog
 from companion.session import VehicleSession
 from companion.state import FLYING
 from companion.thinker import Thinker
@@ -68,6 +69,7 @@ class Service:
             sources=(*config.lockstep_sources, *config.obstacles.required),
             on_report=log.warning,
             doors=config.traffic.open_doors,
+            unix_ns=clock.unix_ns,
         )
         self._traffic = TrafficDoors(
             config.traffic,
@@ -100,8 +102,8 @@ class Service:
         self._stopping = False
         self._pending: VehicleState | None = None  # the newest state, not yet answered
         self._arrived_ns = 0  # its arrival, for the latency figure
+        self._arrived_unix_ns = 0  # and for the log
         self._vehicle_ns = 0  # vehicle time of the newest state
-        self._log_failed = False
         self._last_beat: tuple[int, int] | None = None
 
     def stop(self) -> None:
@@ -119,21 +121,29 @@ class Service:
         config = self._config
         loop = asyncio.get_running_loop()
         async with contextlib.AsyncExitStack() as stack:
-            recorder = None
-            if config.log.directory is not None:
-                recorder = Recorder(Path(config.log.directory) / "flight.mcap", config)
-                stack.callback(recorder.close)
-            realtime.apply(config.realtime, log.warning)  # behind the recorder, before the links' threads
+            recorder, scenes = self._open_log(stack)
+            realtime.apply(config.realtime, log.warning)  # behind the log's thread, before those of the links
             await self._transport.open()
             stack.push_async_callback(self._transport.close)
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
-            self._publisher = Publisher(zenoh, recorder)
+            self._publisher = Publisher(zenoh, recorder, scenes)
             self._garbage.take_over(realtime.load_seldom(wait=config.safety.solver == "osqp"))
             stack.callback(self._garbage.hand_back)
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
+
+    def _open_log(self, stack: contextlib.AsyncExitStack) -> tuple[Recorder | None, SceneLog | None]:
+        """The log, where one is wanted, and who draws for it; it hears of packets and texts from now on."""
+        config = self._config
+        if config.log.directory is None:
+            return None, None
+        recorder = Recorder(Path(config.log.directory) / "flight.mcap", config, self._clock)
+        stack.callback(recorder.close)
+        self._transport.on_packet = recorder.packet if config.log.tlog else None
+        self._session.on_text = lambda severity, text: recorder.text(self._vehicle_ns, severity, text)
+        return recorder, SceneLog(recorder, config, lambda: self._traffic.origin) if config.log.scene_hz > 0.0 else None
 
     async def _until_stopped(self) -> None:
         try:
@@ -217,7 +227,16 @@ class Service:
         }
         state = session.situation.state
         record = setpoint_record(vehicle.stamp_ns, state, output, sent=sent, messages=messages, timings_ms=timings_ms)
-        self._publisher.tick(record, state, vehicle, taken.frames, output, self._thinker.tracks)
+        self._publisher.tick(
+            record,
+            state,
+            vehicle,
+            taken.frames,
+            output,
+            self._thinker.tracks,
+            arrived_unix_ns=self._arrived_unix_ns,
+            target_enu=self._route.current,
+        )
         self._services.note(vehicle, output)
         busy_ms = (stopwatch_ns() - started_ns) / 1e6
         self._meter.tick(timings_ms["total"], busy_ms, record.verdict)
@@ -247,15 +266,14 @@ class Service:
         self._services.poll()
         self._flush()
         self._publish_status(now_ns)
-        self._keep_log(now_ns)
+        self._keep_log()
 
-    def _keep_log(self, now_ns: int) -> None:
-        """Flush the log now and then; a log that cannot be written is told once and flown without."""
-        failure = self._publisher.keep_log(now_ns)
-        if failure is not None and not self._log_failed:
-            self._log_failed = True
-            log.error("%s", failure)
-            self._session.say(mav.SEVERITY_WARNING, "companion: log lost, flying on")
+    def _keep_log(self) -> None:
+        """Let the log be written; what goes wrong with it is told once and flown on without."""
+        trouble = self._publisher.keep_log()
+        if trouble is not None:
+            log.error("%s", trouble)
+            self._session.say(mav.SEVERITY_WARNING, "companion: log damaged, flying on")
 
     def _flush(self) -> int:
         """Send what the session has to say; the number of MAVLink packets."""
@@ -279,6 +297,7 @@ class Service:
         groups = {"obstacles": self._inbox.counts, "tracking": self._thinker.tracking_counts}
         groups |= {"mavlink": self._codec.counts, "texts": self._session.text_counts}
         groups |= {"autopilot": self._session.watch.counts, "timesync": self._time.counts}
+        groups |= {"log": self._publisher.log_counts}
         return self._meter.counts(groups) | self._transport.all_counts()
 
     def _summary(self, recorder: Recorder | None) -> Summary:
@@ -313,7 +332,7 @@ class Service:
             return  # reordered or repeated by the link
         self._pending = vehicle
         self._vehicle_ns = vehicle.stamp_ns
-        self._arrived_ns = stopwatch_ns()
+        self._arrived_ns, self._arrived_unix_ns = stopwatch_ns(), self._clock.unix_ns()
         self._barrier.pending()
         self._traffic.on_vehicle(vehicle)
         self._session.heard_vehicle(self._now_ns())

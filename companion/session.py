@@ -60,6 +60,7 @@ class VehicleSession:
         self.armed = False
         self.custom_mode: int | None = None
         self.origin: Callable[[], TangentPlane | None] = lambda: None  # of the local frame, where somebody knows it
+        self.on_text: Callable[[int, str], None] = lambda severity, text: None  # told about each STATUSTEXT sent
         self._attitude: Attitude | None = None
         self._system: int | None = None
         self._component: int | None = None
@@ -207,7 +208,9 @@ class VehicleSession:
         self._ask_streams(now_ns)
         self.watch.poll(now_ns, obeyed=self._obeyed, engaged=self.situation.engaged)
         self._tell()
-        self._outgoing += [self._codec.encode_statustext(*said) for said in self._texts.take(now_ns)]
+        for severity, text in self._texts.take(now_ns):
+            self._outgoing.append(self._codec.encode_statustext(severity, text))
+            self.on_text(severity, text)
 
     # details
 

@@ -77,6 +77,7 @@ class DetectionFrame:
     sequence: int  # arrival number within the source
     kind: DetectionKind
     detections: tuple[Detection, ...]
+    arrived_unix_ns: int | None = field(default=None, compare=False)  # here, on this computer's clock: for the log only
 
     @property
     def order_key(self) -> tuple[int, str, int]:

@@ -21,11 +21,12 @@ MAX_SOURCES = 64
 
 # bytes as they came, a frame that another door decoded, or the call that decodes it
 Payload = bytes | wire.ObstacleFrame | Callable[[], wire.ObstacleFrame]
+_Entry = tuple[int, Payload, str | None, int | None]  # sequence, payload, encoding, arrival
 
 
 @dataclass(slots=True)
 class _Source:
-    queue: deque[tuple[int, Payload, str | None]] = field(default_factory=deque)  # (sequence, payload, encoding)
+    queue: deque[_Entry] = field(default_factory=deque)
     arrived: int = 0  # frames so far; the next one's sequence
     announced: int = 0  # frames that the markers so far stand for
     through_ns: int | None = None  # of the newest marker
@@ -43,6 +44,7 @@ class ObstacleInbox:
         max_age_s: an older frame is rejected at the tick that would use it.
         on_report: told about rejected frames in one line, at most once a second of vehicle time.
         doors: sources of the daemon's own (`push_decoded`); what is published under their names is rejected.
+        unix_ns: tells the time at which frames arrive, for the log.
 
     ``counts`` has frames (accepted), dropped (queue full), thinned and every reason of rejection.
     """
@@ -56,12 +58,14 @@ class ObstacleInbox:
         sources: Iterable[str] = (),
         on_report: Callable[[str], None] | None = None,
         doors: Iterable[str] = (),
+        unix_ns: Callable[[], int | None] = lambda: None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._queue = queue
         self._per_tick = per_tick
         self._max_age_s = max_age_s
         self._on_report = on_report
+        self._unix_ns = unix_ns
         self._doors = frozenset(doors)
         self._configured = (*sources, *sorted(self._doors))
         self._sources = {name: _Source() for name in self._configured}
@@ -100,7 +104,7 @@ class ObstacleInbox:
         if len(entry.queue) >= self._queue:
             entry.queue.popleft()
             self.counts["dropped"] += 1
-        entry.queue.append((sequence, payload, encoding))
+        entry.queue.append((sequence, payload, encoding, self._unix_ns()))
 
     def push_marker(self, source: str, payload: bytes, encoding: str | None = None) -> None:
         """One lockstep marker as it arrived; never raises. A marker that does not advance is rejected."""
@@ -154,7 +158,7 @@ class ObstacleInbox:
         """
         frames: list[DetectionFrame] = []
         for name, entry in self._sources.items():
-            for sequence, payload, encoding in self._taken(entry, self._limit(entry, now_ns)):
+            for sequence, payload, encoding, arrived_unix_ns in self._taken(entry, self._limit(entry, now_ns)):
                 try:
                     frame = ingress.detections_from_frame(
                         _decoded(payload, encoding),
@@ -163,6 +167,7 @@ class ObstacleInbox:
                         now_ns=now_ns,
                         unix_minus_vehicle_ns=unix_minus_vehicle_ns,
                         max_age_s=self._max_age_s,
+                        arrived_unix_ns=arrived_unix_ns,
                     )
                 except FrameRejected as error:
                     self.reject(name, error)
@@ -174,7 +179,7 @@ class ObstacleInbox:
         frames.sort(key=lambda frame: frame.order_key)
         return tuple(frames)
 
-    def _taken(self, entry: _Source, limit: float) -> list[tuple[int, Payload, str | None]]:
+    def _taken(self, entry: _Source, limit: float) -> list[_Entry]:
         """A source's frames of this tick: all, or of more than ``per_tick`` the newest and others evenly before it.
 
         Every frame is a whole picture, so a source that is much faster than the ticks costs no tick its deadline.

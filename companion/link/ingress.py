@@ -29,12 +29,14 @@ def detections_from_frame(
     now_ns: int,
     unix_minus_vehicle_ns: int | None,
     max_age_s: float,
+    arrived_unix_ns: int | None = None,
 ) -> DetectionFrame:
     """Check every bound of the wire contract and convert to the internal type (ENU, vehicle clock).
 
     Args:
         now_ns: the present on the vehicle's clock.
         unix_minus_vehicle_ns: offset of the clocks, None while it is unknown.
+        arrived_unix_ns: noted in the frame, and used for nothing.
     Raises:
         FrameRejected: the frame as a whole, with a short reason.
     """
@@ -54,7 +56,7 @@ def detections_from_frame(
         raise FrameRejected("duplicate_id", "obstacles: expected each id once in a frame")
     ned = payload.frame == "local_ned"
     detections = tuple(_detection(i, o, ned) for i, o in enumerate(payload.obstacles))
-    return DetectionFrame(stamp_ns, source, sequence, DetectionKind(payload.kind), detections)
+    return DetectionFrame(stamp_ns, source, sequence, DetectionKind(payload.kind), detections, arrived_unix_ns)
 
 
 def vehicle_from_payload(payload: VehicleStateIn) -> VehicleState:

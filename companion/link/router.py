@@ -8,7 +8,7 @@ came, signature included; with signing only those that we accept ourselves.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AsyncExitStack
 from functools import partial
 from typing import Any, Protocol
@@ -29,6 +29,7 @@ AUTOPILOT_LINK = 0
 TELL_NS = 10 * NS_PER_S  # another's setpoints are told this often
 
 OnEvents = Callable[[list[Event]], None]
+OnPacket = Callable[[bytes, int, bool], None]  # as on the wire, unix time [us], outgoing
 
 
 class Operator(Protocol):
@@ -67,6 +68,7 @@ class Router:
         self._operator = operator
         self._clock = clock
         self._on_events = on_events
+        self.on_packet: OnPacket | None = None  # told about each packet in or out, for a log
         self.heard_ns: int | None = None  # when bytes last came on the autopilot's link, monotonic clock
         self._framers = [codec.new_framer() for _ in self._urls]
         self._routes = Routes(len(self._urls))
@@ -107,11 +109,14 @@ class Router:
     def send(self, data: bytes) -> None:
         """Packets of our codec, to where they belong; never blocks, never raises."""
         if len(self._links) == 1:
-            self._links[AUTOPILOT_LINK].send(self._codec.seal(data))
+            sealed = self._codec.seal(data)
+            self._links[AUTOPILOT_LINK].send(sealed)
+            self._note(packets(sealed), outgoing=True)
             return
         for packet in packets(data) if self._links else ():
             for link in self._own_links(target_of(packet)):
                 self._links[link].send(self._codec.seal(packet, link))
+            self._note((packet,), outgoing=True)
 
     async def close(self) -> None:
         for link in self._links:
@@ -133,8 +138,16 @@ class Router:
             return  # while the others are being opened nobody is at home
         if link == AUTOPILOT_LINK:
             self.heard_ns = self._clock.monotonic_ns()
-        ours = [message for message in self._framers[link].push(data) if self._take(link, message)]
-        self._on_events(self._codec.events(ours))
+        messages = self._framers[link].push(data)
+        self._note((message.get_msgbuf() for message in messages), outgoing=False)
+        self._on_events(self._codec.events([message for message in messages if self._take(link, message)]))
+
+    def _note(self, seen: Iterable[bytes], *, outgoing: bool) -> None:
+        if self.on_packet is None:
+            return
+        unix_us = self._clock.unix_ns() // 1000
+        for packet in seen:
+            self.on_packet(packet, unix_us, outgoing)
 
     def _take(self, link: int, message: Any) -> bool:
         """Learn from a message and pass it on; whether it is for the daemon."""

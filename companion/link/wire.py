@@ -124,6 +124,7 @@ class SetpointRecord(Struct, frozen=True, kw_only=True):
     disturbance: Vec
     tracks: int
     timings_ms: dict[str, float]
+    detour: bool = False  # the answer to a reference along the obstacle's boundary, not to u_ref
 
 
 class VehicleOut(Struct, frozen=True, kw_only=True):
@@ -134,6 +135,7 @@ class VehicleOut(Struct, frozen=True, kw_only=True):
     velocity: Vec
     attitude: tuple[float, float, float, float]
     reset_counter: int | None = None  # of the estimator, where the autopilot tells
+    arrived_unix_ns: int | None = None  # at the daemon, on its computer's clock
 
 
 class TrackOut(Struct, frozen=True, kw_only=True):

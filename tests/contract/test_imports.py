@@ -25,7 +25,14 @@ LAYERS = [
         "companion.config_traffic",
         "companion.config_types",
     },
-    {"companion.tunables", "companion.threats", "companion.texts", "companion.hostload", "companion.realtime"},
+    {
+        "companion.tunables",
+        "companion.threats",
+        "companion.texts",
+        "companion.hostload",
+        "companion.realtime",
+        "companion.tlog",
+    },
     {
         "companion.tracking",
         "companion.safety",
@@ -36,7 +43,11 @@ LAYERS = [
     },
     {"companion.pilot"},
     {"companion.state"},
+    {"companion.log_files", "companion.foxglove", "companion.provenance"},
+    {"companion.log_writer"},
     {"companion.link", "companion.metrics", "companion.route", "companion.report", "companion.record"},
+    {"companion.scene"},
+    {"companion.scene_log"},
     {
         "companion.notices",
         "companion.confirm",
@@ -55,6 +66,7 @@ LAYERS = [
         "companion.publisher",
         "companion.doors",
     },
+    {"companion.logbook"},
     {"companion.service", "companion.publish", "companion.demo", "companion.bench", "companion.doctor"},
     {"companion.cli"},
 ]

