@@ -20,7 +20,8 @@ import zenoh
 from companion.errors import CompanionError, ConfigError
 
 STOP_S = 30.0
-PHYSICS_HZ = (240, 300, 500, 400, 600, 1000)  # the first that the control rate divides
+PHYSICS_HZ = (240, 300, 500, 400, 600, 1000)  # the first with a whole number of steps a tick, and at least:
+STEPS = 4
 # centre [m], axis, tilt and phase [deg]: as in the simulator's own bench
 EIGHTS = (
     ((-3.12, 2.5, 1.5), 90.0, 0.0, 0.0),
@@ -130,9 +131,11 @@ def physics_hz(rate_hz: int) -> int:
         ConfigError: none of `PHYSICS_HZ` fits.
     """
     for hz in PHYSICS_HZ:
-        if hz % rate_hz == 0 and 1000 % rate_hz == 0:
+        if hz % rate_hz == 0 and hz >= STEPS * rate_hz and 1000 % rate_hz == 0:
             return hz
-    raise ConfigError(f"bench: expected a rate that divides 1000 and one of {PHYSICS_HZ}, got {rate_hz} Hz")
+    raise ConfigError(
+        f"bench: expected a rate that divides 1000 and, {STEPS} times or more, one of {PHYSICS_HZ}, got {rate_hz} Hz"
+    )
 
 
 def daemon_settings(links: Links, rate_hz: int, log: Path, *, lockstep: bool) -> tuple[str, ...]:
