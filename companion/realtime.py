@@ -1,4 +1,4 @@
-"""What the interpreter and the operating system may do to a tick, kept out of it (``[realtime]``, `docs/explanation/realtime.md`).
+"""What interpreter and system may do to a tick, kept out of it (``[realtime]``, docs/explanation/realtime.md).
 
 Garbage is collected in the idle part of a period, libraries compute on one thread, what takes long to load and is
 seldom needed is loaded beside the wait for the vehicle; cores, SCHED_FIFO and locked memory are asked for where
