@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib
 import logging
+import threading
 from pathlib import Path
 
 from companion import realtime
@@ -132,6 +134,7 @@ class Service:
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._vitals.close)
             recorder, scenes = self._open_log(stack)
+            loading = self._load()
             realtime.apply(config.realtime, log.warning)  # behind the recorder, before the links' threads
             await self._transport.open()
             stack.push_async_callback(self._transport.close)
@@ -140,12 +143,19 @@ class Service:
             self._publisher = Publisher(zenoh, recorder, scenes, self._journal)
             if config.http.enabled:
                 await self._serve_http(stack)
-            self._garbage.take_over(realtime.load_seldom(wait=config.safety.solver == "osqp"))
+            self._garbage.take_over(loading)
             stack.callback(self._garbage.hand_back)
             self._vitals.up(self._publisher)
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
+
+    def _load(self) -> threading.Thread | None:
+        """Import what takes long before Zenoh tells that we are there: lockstep gives the first answer a second."""
+        if self._config.http.enabled:
+            for name in ("companion.http", "companion.page.handlers", "companion.probes"):
+                importlib.import_module(name)
+        return realtime.load_seldom(wait=self._lockstep or self._config.safety.solver == "osqp")
 
     def _open_log(self, stack: contextlib.AsyncExitStack) -> tuple[Recorder | None, SceneLog | None]:
         """The log, where one is wanted, and who draws for it; it hears of packets and texts from now on."""
