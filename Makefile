@@ -64,7 +64,7 @@ check: $(VENV)/dev.stamp  ## lint, format check, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/mypy -p tools
+	MYPYPATH=docs $(BIN)/mypy -p docgen
 
 docs: $(VENV)/dev.stamp  ## make the reference pages from the code
 	PYTHONPATH=docs $(BIN)/python -m docgen
