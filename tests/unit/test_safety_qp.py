@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import osqp
 import pytest
 
 from companion.errors import SolverError
@@ -120,19 +121,19 @@ def test_osqp_is_polished_and_silent(capfd: pytest.CaptureFixture[str]) -> None:
 
 def test_what_a_solver_names_otherwise_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     stopped = SimpleNamespace(info=SimpleNamespace(status="maximum iterations reached"), x=np.zeros(2))
-    monkeypatch.setattr(qp.osqp.OSQP, "solve", lambda *_, **__: stopped)
+    monkeypatch.setattr(osqp.OSQP, "solve", lambda *_, **__: stopped)
     assert solve_osqp(program([], [])) is None
 
 
 def test_osqp_is_pinned(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its penalty changes by iterations, not by time, or answers would depend on the load of the machine."""
-    real, given = qp.osqp.OSQP.setup, {}
+    real, given = osqp.OSQP.setup, {}
 
     def setup(*arguments: object, **settings: object) -> None:
         given.update(settings)
         real(*arguments, **settings)
 
-    monkeypatch.setattr(qp.osqp.OSQP, "setup", setup)
+    monkeypatch.setattr(osqp.OSQP, "setup", setup)
     solve_osqp(program([], []))
     assert given["adaptive_rho_interval"] == 25
     assert given["max_iter"] == 4000
