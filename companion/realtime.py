@@ -13,15 +13,23 @@ import importlib
 import os
 import sys
 import threading
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, MutableMapping, Sequence
 
 from companion.clock import stopwatch_ns
 from companion.config_realtime import RealtimeConfig
 from companion.errors import ConfigError
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# the second solver, and the assignment of anonymous detections: longer to load than all the rest together
-SELDOM = ("osqp", "scipy.sparse", "scipy.optimize")
+# the second solver and the assignment of anonymous detections, in pieces: what they load, then they themselves
+SELDOM = (
+    "scipy.sparse",
+    "osqp",
+    "scipy.linalg",
+    "scipy.special",
+    "scipy.fft",
+    "scipy.spatial",
+    "scipy.optimize",
+)
 
 YOUNG = 1_000  # containers made and not freed since the last collection, from which one is worth its time
 URGENT = 50_000  # from which it no longer waits for an idle moment
@@ -43,24 +51,38 @@ def single_threads(environ: MutableMapping[str, str] = os.environ) -> None:
         environ.setdefault(name, "1")
 
 
-def load_seldom(*, wait: bool = False) -> threading.Thread | None:
+class Loader(threading.Thread):
+    """Imports modules one by one beside everything else, until `stop`."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        super().__init__(name="load")
+        self._names = names
+        self._stopped = False
+
+    def run(self) -> None:
+        for name in self._names:
+            if self._stopped:
+                return
+            importlib.import_module(name)
+
+    def stop(self) -> None:
+        """Nothing more after the module in progress: the process does not end before its threads."""
+        self._stopped = True
+
+
+def load_seldom(*, wait: bool = False) -> Loader | None:
     """Import `SELDOM` on a thread of its own, or with ``wait`` here; returns the thread, None where none is needed.
 
     Loaded on first use instead, they would cost that tick a third of a second.
     """
     missing = [name for name in SELDOM if name not in sys.modules]
+    loader = Loader(missing)
     if wait:
-        _load(missing)
+        loader.run()
     if wait or not missing:
         return None
-    thread = threading.Thread(target=_load, args=(missing,), name="load")
-    thread.start()
-    return thread
-
-
-def _load(names: list[str]) -> None:
-    for name in names:
-        importlib.import_module(name)
+    loader.start()
+    return loader
 
 
 def apply(config: RealtimeConfig, say: Say) -> None:
@@ -128,12 +150,12 @@ class Collector:
         self._took_ns = [_FIRST_NS, 4 * _FIRST_NS]  # of the young, of everything
         self._young = 0  # collections since the last full one
         self._was_enabled = False
-        self._loading: threading.Thread | None = None
+        self._loading: Loader | None = None
 
-    def take_over(self, loading: threading.Thread | None = None) -> None:
+    def take_over(self, loading: Loader | None = None) -> None:
         """From here on nothing is collected by itself, and what exists now is never walked: it lives to the end.
 
-        So does what the thread ``loading`` (of `load_seldom`) has made when it is done.
+        So does what ``loading`` has made when it is done.
         """
         self._was_enabled = gc.isenabled()
         self._loading = loading
@@ -142,7 +164,9 @@ class Collector:
         gc.disable()
 
     def hand_back(self) -> None:
-        """As it was before `take_over`."""
+        """As it was before `take_over`; what is still being loaded is given up."""
+        if self._loading is not None:
+            self._loading.stop()
         gc.unfreeze()
         if self._was_enabled:
             gc.enable()

@@ -115,21 +115,40 @@ def test_a_full_collection_needs_a_longer_idle_moment_than_it_last_took(
         assert collections == expected
 
 
-def test_what_a_thread_still_loads_is_left_alone_and_then_lives_on(
-    collections: list[int], monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def slow_imports(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[list[str], threading.Event, threading.Event]]:
+    """What was imported; set when the first of two is under way; it lasts until the second event."""
+    told: list[str] = []
+    begun, done = threading.Event(), threading.Event()
+
+    def load(name: str) -> None:
+        told.append(name)
+        begun.set()
+        done.wait()
+
+    monkeypatch.setattr(realtime, "SELDOM", ("xdrlib_a", "xdrlib_b"))
+    monkeypatch.setattr(realtime.importlib, "import_module", load)
+    yield told, begun, done
+    done.set()
+
+
+def test_what_is_still_being_loaded_is_left_alone_and_then_lives_on(
+    slow_imports: tuple[list[str], threading.Event, threading.Event],
+    collections: list[int],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    loaded = threading.Event()
-    thread = threading.Thread(target=loaded.wait)
-    thread.start()
+    _, _, done = slow_imports
+    loader = realtime.load_seldom()
+    assert loader is not None
     taken = realtime.Collector(lambda: 0)
-    taken.take_over(thread)
+    taken.take_over(loader)
     try:
         collections.clear()
         made(monkeypatch, realtime.URGENT)
         taken.idle(40 * MS)
         assert collections == []
-        loaded.set()
-        thread.join()
+        done.set()
+        loader.join()
         frozen = gc.get_freeze_count()
         taken.idle(40 * MS)
         assert collections == []
@@ -137,8 +156,22 @@ def test_what_a_thread_still_loads_is_left_alone_and_then_lives_on(
         taken.idle(40 * MS)
         assert collections == [1]
     finally:
-        loaded.set()
         taken.hand_back()
+
+
+def test_a_daemon_that_ends_waits_for_one_module_only(
+    slow_imports: tuple[list[str], threading.Event, threading.Event],
+) -> None:
+    told, begun, done = slow_imports
+    loader = realtime.load_seldom()
+    assert loader is not None
+    taken = realtime.Collector()
+    taken.take_over(loader)
+    begun.wait()
+    taken.hand_back()
+    done.set()
+    loader.join()
+    assert told == ["xdrlib_a"]
 
 
 def test_one_thread_unless_the_environment_says_otherwise() -> None:
