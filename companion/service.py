@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import importlib
 import logging
-import threading
 from pathlib import Path
 
 from companion import realtime
@@ -150,7 +149,7 @@ class Service:
             await self._until_stopped()
         return self._summary(recorder)
 
-    def _load(self) -> threading.Thread | None:
+    def _load(self) -> realtime.Loader | None:
         """Import what takes long before Zenoh tells that we are there: lockstep gives the first answer a second."""
         if self._config.http.enabled:
             for name in ("companion.http", "companion.page.handlers", "companion.probes"):

@@ -16,6 +16,7 @@ from tracking_scenes import frame, seen, vehicle
 
 from companion.cli import main
 from companion.config import Config, parse_config
+from companion.journal import Journal
 from companion.link import wire
 from companion.logbook.export import export
 from companion.logbook.reader import LogUnreadable, open_log
@@ -49,12 +50,14 @@ class Nobody:
 def fly(folder: Path, config: Config, ticks: int = TICKS) -> Path:
     """Fly a pilot past one obstacle that comes to meet it, as the service does, into a log."""
     recorder = Recorder(folder / "flight.mcap", config)
-    publisher, pilot = Publisher(Nobody(), recorder, SceneLog(recorder, config, lambda: None)), Pilot(config)
+    flies = Pilot(config)
+    pilot = Journal(flies, config, artifact=flies.artifact)
+    publisher = Publisher(Nobody(), recorder, SceneLog(recorder, config, lambda: None), pilot)
     p, v, target = np.array([0.0, 0.0, 2.0]), np.zeros(3), frozen([6.0, 0.0, 2.0])
     for k in range(ticks):
         t = PERIOD_S * k
         own, frames = vehicle(t, p, v), (frame(t, seen("ball", [5.0 - t, 0.1, 2.0]), sequence=k),)
-        output = pilot.step(PilotInput(own, frames, target_enu=target))
+        output = pilot.step(PilotInput(own, frames, target_enu=target), sent=True)
         timings = {"total": 2.0 + 0.01 * k, "brain": 1.0, "queue": 0.1}
         record = setpoint_record(output.stamp_ns, State.ACTIVE, output, sent=True, messages=1, timings_ms=timings)
         publisher.tick(record, State.ACTIVE, own, frames, output, pilot.tracks, arrived_unix_ns=7, target_enu=target)
