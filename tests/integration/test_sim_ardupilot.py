@@ -59,7 +59,10 @@ after = "airborne_hover"
 
 @pytest.mark.parametrize(
     ("z", "operator", "pace"),
-    [(0.2, FROM_THE_GROUND, ()), (1.5, IN_THE_AIR, ("--real-time",))],
+    [
+        (0.2, FROM_THE_GROUND, ()),
+        pytest.param(1.5, IN_THE_AIR, ("--real-time",), marks=pytest.mark.slow),
+    ],
     ids=["lockstep", "real-time"],
 )
 def test_the_daemon_flies_it(tmp_path: Path, z: float, operator: str, pace: tuple[str, ...]) -> None:

@@ -12,6 +12,7 @@ from sim_bridge.cli import main
 pytestmark = pytest.mark.integration
 
 
+@pytest.mark.slow
 def test_the_three_cases_and_where_their_time_goes(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

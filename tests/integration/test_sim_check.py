@@ -82,7 +82,12 @@ share = 0.3
 
 
 @pytest.mark.parametrize(
-    ("what", "more"), [("drop", "share = 0.3"), ("reorder", "share = 0.3"), ("freeze", "for_s = 0.4")]
+    ("what", "more"),
+    [
+        ("drop", "share = 0.3"),
+        pytest.param("reorder", "share = 0.3", marks=pytest.mark.slow),
+        pytest.param("freeze", "for_s = 0.4", marks=pytest.mark.slow),
+    ],
 )
 def test_the_same_seed_loses_the_same_messages(tmp_path: Path, what: str, more: str) -> None:
     faults = FAULTY.format(what=what, more=more)
