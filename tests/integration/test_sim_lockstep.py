@@ -232,6 +232,7 @@ def flight(folder: Path, *, withhold: str = "", steps: tuple[str, ...] = ("arm",
             each.join()
 
 
+@pytest.mark.slow
 def test_same_seed_same_flight_to_the_bit(tmp_path: Path) -> None:
     traces = []
     for name in ("first", "second"):

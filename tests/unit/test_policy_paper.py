@@ -139,6 +139,7 @@ def test_the_table_stands_beside_the_papers() -> None:
     assert rows["Pure RL (Case 2)"] == ["N/A", ours[1], "-", "-", "160 s", "0.84 m / 0.93 m / 0 m"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_figures_and_json_and_takes_networks_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
