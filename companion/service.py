@@ -133,28 +133,29 @@ class Service:
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._vitals.close)
             recorder, scenes = self._open_log(stack)
-            loading = self._load()
             realtime.apply(config.realtime, log.warning)  # behind the recorder, before the links' threads
-            await self._transport.open()
+            await self._transport.open()  # first: a heartbeat that comes while the rest is loaded waits in the socket
             stack.push_async_callback(self._transport.close)
+            self._load()
             zenoh = ZenohLink.open(config.zenoh, config.prefix, loop, self._doors.handlers(), lockstep=self._lockstep)
             stack.callback(zenoh.close)
             self._publisher = Publisher(zenoh, recorder, scenes, self._journal)
             if config.http.enabled:
                 await self._serve_http(stack)
-            self._garbage.take_over(loading)
+            self._garbage.take_over(realtime.load_seldom())
             stack.callback(self._garbage.hand_back)
             self._vitals.up(self._publisher)
             log.info("up: %s, zenoh prefix %s", config.mavlink.url, config.prefix)
             await self._until_stopped()
         return self._summary(recorder)
 
-    def _load(self) -> realtime.Loader | None:
+    def _load(self) -> None:
         """Import what takes long before Zenoh tells that we are there: lockstep gives the first answer a second."""
         if self._config.http.enabled:
             for name in ("companion.http", "companion.page.handlers", "companion.probes"):
                 importlib.import_module(name)
-        return realtime.load_seldom(wait=self._lockstep or self._config.safety.solver == "osqp")
+        if self._lockstep or self._config.safety.solver == "osqp":
+            realtime.load_seldom(wait=True)
 
     def _open_log(self, stack: contextlib.AsyncExitStack) -> tuple[Recorder | None, SceneLog | None]:
         """The log, where one is wanted, and who draws for it; it hears of packets and texts from now on."""

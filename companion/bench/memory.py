@@ -35,6 +35,7 @@ RATE_HZ, OBSTACLES = 20, 4
 MINUTES, QUICK_MINUTES = 60.0, 3.0
 LIMIT_MIB, GROWTH_MIB = 200.0, 4.0
 SETTLED_SHARE = 1.0 / 6.0  # of the flight, after which memory is held to be flat
+LOG_SETTINGS = ("log.max_mb=64", "log.keep_mb=192")  # an hour's log would be 1.5 GB
 STALL_S = 30.0
 _POLL_S = 0.1
 
@@ -72,7 +73,7 @@ def measure_memory(minutes: float, progress: Callable[[float], None]) -> Memory:
         scenario.write_text(scenario_text(RATE_HZ, OBSTACLES, seconds), encoding="utf-8")
         config.write_text("# everything at its default\n", encoding="utf-8")
         words = ["companion.cli", "run", "--json", "-c", str(config)]
-        for setting in daemon_settings(links, RATE_HZ, folder, lockstep=True):
+        for setting in (*daemon_settings(links, RATE_HZ, folder, lockstep=True), *LOG_SETTINGS):
             words += ["--set", setting]
         ground = Ground(links.ground)
         with (
