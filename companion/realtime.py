@@ -31,6 +31,7 @@ SELDOM = (
     "scipy.optimize",
 )
 
+SWITCH_S = 0.001  # for which the thread of the log may keep the interpreter from the control thread; Python's: 0.005
 YOUNG = 1_000  # containers made and not freed since the last collection, from which one is worth its time
 URGENT = 50_000  # from which it no longer waits for an idle moment
 FULL_EVERY = 64  # collections of the young between two of everything
@@ -140,7 +141,7 @@ def _lock_memory(say: Say) -> None:
 
 
 class Collector:
-    """Python's garbage collector, run between ticks instead of whenever enough was allocated.
+    """Python's garbage collector, run between ticks instead of whenever enough was allocated; and the lock of threads.
 
     Reference counting frees nearly all that a tick makes; the collector finds cycles, which need not be found at once.
     """
@@ -149,16 +150,18 @@ class Collector:
         self._stopwatch = stopwatch
         self._took_ns = [_FIRST_NS, 4 * _FIRST_NS]  # of the young, of everything
         self._young = 0  # collections since the last full one
-        self._was_enabled = False
+        self._was_enabled, self._switch_s = False, sys.getswitchinterval()
         self._loading: Loader | None = None
 
     def take_over(self, loading: Loader | None = None) -> None:
         """From here on nothing is collected by itself, and what exists now is never walked: it lives to the end.
 
-        So does what ``loading`` has made when it is done.
+        So does what ``loading`` has made when it is done. A waiting thread gets the interpreter within `SWITCH_S`.
         """
         self._was_enabled = gc.isenabled()
         self._loading = loading
+        self._switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -167,6 +170,7 @@ class Collector:
         """As it was before `take_over`; what is still being loaded is given up."""
         if self._loading is not None:
             self._loading.stop()
+        sys.setswitchinterval(self._switch_s)
         gc.unfreeze()
         if self._was_enabled:
             gc.enable()

@@ -41,14 +41,16 @@ def made(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
 
 def test_nothing_is_collected_by_itself_and_all_is_as_before_afterwards() -> None:
     assert gc.isenabled()
-    frozen = gc.get_freeze_count()
+    frozen, switch_s = gc.get_freeze_count(), sys.getswitchinterval()
     taken = realtime.Collector()
     taken.take_over()
     assert not gc.isenabled()
+    assert sys.getswitchinterval() == pytest.approx(realtime.SWITCH_S)
     assert gc.get_freeze_count() > frozen
     taken.hand_back()
     assert gc.isenabled()
     assert gc.get_freeze_count() == 0
+    assert sys.getswitchinterval() == switch_s
 
 
 def test_a_cycle_goes_in_an_idle_moment(collector: realtime.Collector) -> None:
