@@ -8,26 +8,10 @@ import pytest
 
 pytest.importorskip("mavsdk.asyncio")
 
-from mavsdk_cases import (
-    actions,
-    blocking,
-    direct,
-    harness,
-    information,
-    offboarding,
-    parameters,
-    peers,
-    pilot,
-    plans,
-    rates,
-    telemetry,
-)
+from mavsdk_cases import harness, peers
+from mavsdk_cases.every import CASES
 
 pytestmark = pytest.mark.integration
-
-CASES = harness.cases_of(
-    actions, blocking, direct, information, offboarding, parameters, pilot, plans, rates, telemetry
-)
 
 
 @pytest.fixture(scope="module")
