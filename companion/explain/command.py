@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from companion.errors import CompanionError, ConfigError
+from companion.errors import ConfigError
 from companion.explain.facts import facts
 from companion.explain.moment import Outline, intervention, moment, outlines
 from companion.explain.words import paragraphs
@@ -19,6 +19,7 @@ from companion.logbook.reader import open_log
 from companion.pilot import Task
 from companion.replay.moments import engaged_ns, moment_ns
 from companion.replay.progress import progress
+from companion.replay.usage import as_usage
 from companion.types import NS_PER_S
 
 WIDTH = 112
@@ -49,11 +50,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Do it; a log that cannot be read is wrong usage, as a configuration is: status 1 means something else here."""
-    try:
+    """Do it."""
+    with as_usage():
         return _run(arguments)
-    except CompanionError as error:
-        raise ConfigError(str(error)) from None
 
 
 def _run(arguments: argparse.Namespace) -> int:

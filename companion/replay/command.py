@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from companion.config import Config, apply_overrides, load_config, parse_config
-from companion.errors import CompanionError, ConfigError
+from companion.errors import ConfigError
 from companion.journal_format import Step
 from companion.logbook.reader import open_log
 from companion.numerics import this_machine
@@ -21,6 +21,7 @@ from companion.replay.journal_reader import JournalReader
 from companion.replay.moments import engaged_ns, moment_ns
 from companion.replay.player import Played, Player, Variant, seconds
 from companion.replay.progress import Advance, progress
+from companion.replay.usage import as_usage
 from companion.replay.whatif import Commanded, WhatIf, as_json, judge
 
 _EPILOG = """\
@@ -65,11 +66,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Do it; a log that cannot be read is wrong usage, as a configuration is: status 1 means something else here."""
-    try:
+    """Do it."""
+    with as_usage():
         return _run(arguments)
-    except CompanionError as error:
-        raise ConfigError(str(error)) from None
 
 
 def _run(arguments: argparse.Namespace) -> int:
