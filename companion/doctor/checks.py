@@ -86,6 +86,7 @@ def _stream(name: str, stream: Stream, config: Config, measured_s: float) -> Che
         heard += " (an estimator without a position sends none: it may need a minute, or a fix)"
     timeout_s = config.mavlink.heartbeat_timeout_s if name == "HEARTBEAT" else config.vehicle.stale_s
     late = name != "EXTENDED_SYS_STATE" and (stream.longest_gap_s or 0.0) > timeout_s
+    measured_s = stream.measured_s or measured_s
     counted = 0.0 if stream.heard_hz == 0.0 else 1.0  # a window may begin just behind a message and end just before one
     share = (stream.heard_hz * measured_s + counted) / (stream.wanted_hz * measured_s)
     return grade(

@@ -153,7 +153,8 @@ class MavlinkProbe:
                 self._beats[event.system, event.component] = event
                 if self._chosen is None:
                     self._latch.heard(event, now_ns)
-                    self._choose(now_ns)
+                    if self._choose(now_ns) and "HEARTBEAT" in self._arrivals:
+                        self._arrivals["HEARTBEAT"].append(now_ns)  # the one that it was found by
             case TimesyncReply() if (event.system, event.component) == self._chosen:
                 sample = {"tc1_ns": event.tc1_ns, "ts1_ns": event.ts1_ns, "now_ns": now_ns, "unix_ns": unix_ns}
                 if self._timesync.reply(**sample):
@@ -169,16 +170,18 @@ class MavlinkProbe:
 
     # details
 
-    def _choose(self, now_ns: int) -> None:
+    def _choose(self, now_ns: int) -> bool:
+        """Whether there is one now."""
         chosen = self._latch.choose(now_ns)
         if chosen is None:
-            return
+            return False
         system, component, autopilot = chosen
         self._chosen, self._chosen_ns = (system, component), now_ns
         self._codec.system = system
         names = parameters.NAMES.get(autopilot, ())
         writable = not self._beats[self._chosen].armed
         self._dialogue = ParameterDialogue(system, component, autopilot, names, self._fixes, writable=writable)
+        return True
 
     @property
     def _window(self) -> tuple[int, int]:
@@ -187,11 +190,13 @@ class MavlinkProbe:
 
     def _stream(self, name: str) -> Stream:
         begin_ns, end_ns = self._window
+        if name == "HEARTBEAT":  # nobody asks for it, so nothing has to settle; at 1 Hz a short window may hold none
+            begin_ns = self._chosen_ns
         inside = [t for t in self._arrivals[name] if begin_ns <= t < end_ns]
         gaps = [after - before for before, after in itertools.pairwise(inside)]
-        heard_hz = len(inside) * NS_PER_S / self._duration_ns
+        measured_s = (end_ns - begin_ns) / NS_PER_S
         longest_s = max(gaps) / NS_PER_S if gaps else None
-        return Stream(self._wanted_hz[name], heard_hz, longest_s, self._acks.get(name))
+        return Stream(self._wanted_hz[name], len(inside) / measured_s, longest_s, self._acks.get(name), measured_s)
 
     def _ask_streams(self, now_ns: int) -> list[bytes]:
         """SET_MESSAGE_INTERVAL for each stream until it comes, as the daemon does; SYSTEM_TIME once a second.

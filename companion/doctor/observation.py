@@ -19,6 +19,7 @@ class Stream:
     heard_hz: float
     longest_gap_s: float | None  # None below two messages
     ack: int | None = None  # MAV_RESULT of SET_MESSAGE_INTERVAL, None without an answer or where none was asked
+    measured_s: float | None = None  # over which it was counted, None: the whole measuring window
 
 
 @dataclass(frozen=True, slots=True)

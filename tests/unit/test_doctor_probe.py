@@ -226,3 +226,19 @@ def test_without_timesync_unix_ages_are_known_and_vehicle_ages_are_not() -> None
     boot, unix = log.result(NS_PER_S, unix_minus_vehicle_ns=None, max_age_s=0.5)
     assert unix.least_age_s == pytest.approx(0.005)
     assert (boot.least_age_s, boot.rejected) == (None, {})
+
+
+def test_a_heartbeat_that_falls_just_outside_a_short_window_is_heard() -> None:
+    """At 1 Hz a second may hold none; what came since the autopilot was found counts, for nobody asks for them."""
+    probe = MavlinkProbe(MavlinkCodec(system=1), system_id=1, streams={"HEARTBEAT": 1.0}, duration_s=1.0)
+    autopilot = dialect.MAVLink(None, 1, 1)
+    for k in range(400):
+        now_ns = 10 * NS_PER_S + k * 10_000_000
+        if k in (0, 99, 201, 300):  # [s / 100]; the window is from 100 to 200
+            probe.receive(autopilot.heartbeat_encode(2, PX4, 1, 0, 3).pack(autopilot), now_ns, UNIX_NS)
+        probe.poll(now_ns)
+    seen = probe.result()
+    assert seen is not None
+    stream = seen.streams["HEARTBEAT"]
+    assert stream.heard_hz == pytest.approx(1.0)
+    assert stream.measured_s == pytest.approx(2.0)
